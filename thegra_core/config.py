@@ -1,0 +1,290 @@
+"""Every parameter of Thegra: one pydantic model with defaults, units, ranges and where each value comes from.
+
+Sources named in the descriptions: `paper` = arXiv 2602.08531; `ORB-SLAM3` = Campos et al. 2021 and its published constants;
+`measured` = chosen on real thermal recordings by the benchmarks of this repository.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from thegra_core.errors import ConfigError
+
+PROFILES = ("paper", "quality", "fast")
+
+
+class Section(BaseModel):
+    """Base of all sections: unknown keys are errors, values cannot change after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+# ---- preprocessing (paper Sec. III-B and IV-B) -------------------------------------------------------------------------------------
+
+
+class ChambolleTv(Section):
+    """Total-variation denoising (Chambolle 2004), weight in grey levels of the array it gets."""
+
+    filter: Literal["chambolle_tv"] = "chambolle_tv"
+    weight: float = Field(4.0, gt=0, description="grey levels; paper: 4")
+    eps: float = Field(2e-4, gt=0, description="relative change of the cost that stops the iteration; scikit-image default")
+    max_iterations: int = Field(200, ge=1, description="scikit-image default")
+
+
+class HistogramClip(Section):
+    """Two-tail clip and linear map to 8 bit: the authors' "histogram equalisation, cumulative pixel count 10000"."""
+
+    filter: Literal["he_clip"] = "he_clip"
+    tail_fraction: float = Field(10000 / (640 * 512), ge=0, lt=0.5, description="share of pixels beyond each limit; paper: 10000 px of 640x512")
+    fold: bool = Field(False, description="mirror values below the lower limit instead of clamping them, as the authors' 2024 script did")
+
+
+class HistogramCdf(Section):
+    """Classical histogram equalisation by the cumulative distribution, to 8 bit (Pizer et al. 1987)."""
+
+    filter: Literal["he_cdf"] = "he_cdf"
+
+
+class Clahe(Section):
+    """Contrast-limited adaptive histogram equalisation (Zuiderveld 1994) on 8 or 16 bit."""
+
+    filter: Literal["clahe"] = "clahe"
+    clip_limit: float = Field(2.0, gt=0, description="paper: 2")
+    tiles: int = Field(8, ge=1, le=64, description="tiles a side; paper: 8")
+
+
+class Median(Section):
+    """Median of a square window."""
+
+    filter: Literal["median"] = "median"
+    size: Literal[3, 5] = Field(3, description="px; paper: 3")
+
+
+class BandPass(Section):
+    """Binary ring in the centred 2-D spectrum, radii in bins of the full image."""
+
+    filter: Literal["band_pass"] = "band_pass"
+    low: float = Field(0.0, ge=0, description="FFT bins; paper: 0")
+    high: float = Field(87.0, gt=0, description="FFT bins; paper: 87")
+
+
+class Bilateral(Section):
+    """Bilateral filter (Tomasi and Manduchi 1998)."""
+
+    filter: Literal["bilateral"] = "bilateral"
+    diameter: int = Field(4, ge=1, le=15, description="px; paper: 4")
+    sigma_color: float = Field(35.0, gt=0, description="grey levels; not in the paper, taken equal to sigma_space")
+    sigma_space: float = Field(35.0, gt=0, description="px; paper: 35")
+
+
+class PercentileStretch(Section):
+    """Linear map of a percentile range to 8 bit."""
+
+    filter: Literal["stretch"] = "stretch"
+    low: float = Field(1.0, ge=0, lt=50, description="per cent")
+    high: float = Field(99.0, gt=50, le=100, description="per cent")
+
+
+Filter = Annotated[
+    ChambolleTv | HistogramClip | HistogramCdf | Clahe | Median | BandPass | Bilateral | PercentileStretch, Field(discriminator="filter")
+]
+
+
+class ShutterConfig(Section):
+    """When the stream shows that the camera's shutter is closed."""
+
+    enabled: bool = True
+    gap_periods: float = Field(4.0, gt=1, description="frame periods; a longer gap between stamps counts as a closure when the stream runs evenly")
+    max_jitter: float = Field(0.3, gt=0, description="relative spread of the period above which gaps say nothing (photo flights)")
+
+
+class PreprocessingConfig(Section):
+    """Raw image to the 8-bit image the network sees; filters run in the order given."""
+
+    filters: tuple[Filter, ...] = (ChambolleTv(), HistogramClip(), Median())
+    shutter: ShutterConfig = ShutterConfig()
+
+
+# ---- front end (paper Sec. III-A) -------------------------------------------------------------------------------------------------
+
+
+class ExtractorConfig(Section):
+    """Keypoint detector and descriptor."""
+
+    name: Literal["superpoint", "aliked", "xfeat", "sift", "orb"] = "aliked"
+    max_keypoints: int = Field(1024, ge=32, le=8192)
+    detection_threshold: float = Field(0.0, ge=0, description="least score; 0: the strongest max_keypoints, whatever their score (measured: SuperPoint's own 0.0005 finds too few on thermal frames)")
+    nms_radius: int = Field(4, ge=1, le=32, description="px; SuperPoint's default")
+    border: int = Field(4, ge=0, le=64, description="px at the image's edge without keypoints")
+    long_side: int | None = Field(None, ge=128, description="px; images are scaled so that the long side has this length before detection; none: as they are")
+    device: str = Field("auto", description="auto, cpu, cuda, cuda:0, ...")
+
+
+class MatcherConfig(Section):
+    """Learned or nearest-neighbour matching."""
+
+    name: Literal["auto", "lightglue", "lighterglue", "nearest"] = Field("auto", description="auto: the learned matcher of the extractor, nearest for sift and orb")
+    threshold: float = Field(0.1, ge=0, le=1, description="least confidence of a learned match; LightGlue's default")
+    depth_confidence: float = Field(0.95, ge=-1, le=1, description="LightGlue's early exit; -1: off")
+    width_confidence: float = Field(0.99, ge=-1, le=1, description="LightGlue's pruning; -1: off")
+    ratio: float = Field(0.85, gt=0, le=1, description="nearest neighbour over second nearest; Lowe 2004 uses 0.8")
+    device: str = Field("auto", description="auto, cpu, cuda, cuda:0, ...")
+
+
+# ---- the method (paper Sec. III-C, III-D) -----------------------------------------------------------------------------------------
+
+
+class InitializationConfig(Section):
+    """First map: reference frame, models, and what a map must show before it is claimed."""
+
+    min_matches: int = Field(50, ge=8, description="fewer matches than this over a gap longer than max_gap_frames advance the reference frame")
+    max_gap_frames: int = Field(30, ge=1, description="frames")
+    min_points: int = Field(50, ge=8, description="triangulated points of a map; ORB-SLAM3: 50")
+    min_parallax_deg: float = Field(1.0, gt=0, description="degrees, median over the map's points; ORB-SLAM3: 1")
+    max_reprojection_px: float = Field(2.0, gt=0, description="px; ORB-SLAM3: 2 (4 sigma^2)")
+    magsac_threshold_px: float = Field(1.0, gt=0, description="px")
+    rotation_only_px: float = Field(2.0, gt=0, description="px; matches within this of the best pure rotation show no parallax")
+    rotation_only_ratio: float = Field(0.7, gt=0, le=1, description="share of such matches above which the camera is said to turn only")
+    ambiguity_ratio: float = Field(1.3, ge=1, description="least cost of the second-best motion hypothesis over the best; below it the start waits (plane seen by few views)")
+    window: int = Field(8, ge=2, le=30, description="frames between reference and current that take part in the first bundle adjustment")
+
+
+class TrackingConfig(Section):
+    """Two-stage tracking."""
+
+    min_reference_matches: int = Field(15, ge=4, description="matches that see a landmark; ORB-SLAM3: 15")
+    min_reference_inliers: int = Field(10, ge=4, description="ORB-SLAM3: 10")
+    min_inliers: int = Field(25, ge=6, description="inliers after the second stage; ORB-SLAM3: 30, thermal frames have fewer points")
+    local_keyframes: int = Field(20, ge=1, description="keyframes whose landmarks are projected")
+    max_view_angle_deg: float = Field(60.0, gt=0, lt=180, description="degrees; paper: 60")
+    depth_margin: float = Field(2.0, ge=1, description="a landmark is looked for between its least observed distance over this and its largest times this; the detectors have no octaves")
+    search_radius_px: float = Field(4.0, gt=0, description="px; ORB-SLAM3: 2.5 to 4 px")
+    wide_search_radius_px: float = Field(12.0, gt=0, description="px; when only the motion model gave the first pose")
+    min_descriptor_similarity: float = Field(0.75, ge=-1, le=1, description="cosine of float descriptors; 1 - 2 * Hamming share of binary ones")
+    descriptor_ratio: float = Field(0.9, gt=0, le=1, description="best over second-best descriptor distance among candidates")
+    chi2_px2: float = Field(5.991, gt=0, description="px^2; 95 % of chi-square with 2 degrees of freedom at 1 px")
+
+
+class KeyframeConfig(Section):
+    """When a frame becomes a keyframe (paper Sec. III-C)."""
+
+    rotation_deg: float = Field(15.0, gt=0, description="degrees since the last keyframe; paper: 15")
+    translation_ratio: float = Field(0.03, gt=0, description="displacement over median depth; paper: 0.03")
+    min_tracked_ratio: float = Field(0.5, ge=0, le=1, description="landmarks tracked over those of the reference keyframe; below it a keyframe is due; 0: off, as in the paper")
+
+
+class MappingConfig(Section):
+    """Growing and cleaning the map."""
+
+    covisibility_threshold: int = Field(15, ge=1, description="shared landmarks that make an edge; ORB-SLAM3: 15")
+    neighbours: int = Field(4, ge=1, le=30, description="covisible keyframes that a new keyframe is matched to; ORB-SLAM3: 30, with learned matching each costs a network run")
+    epipolar_px: float = Field(2.0, gt=0, description="px to the epipolar line; chi-square 3.84 at 1 px is 1.96 px")
+    min_parallax_deg: float = Field(1.0, gt=0, description="degrees between the rays of a new point; ORB-SLAM3: 1.15")
+    max_reprojection_px: float = Field(2.0, gt=0, description="px")
+    max_scale_ratio: float = Field(4.0, gt=1, description="distance of a new point in one view over that in the other")
+    min_found_ratio: float = Field(0.25, ge=0, le=1, description="found / predicted visible below which a landmark is culled; paper: 25 %")
+    trial_keyframes: int = Field(3, ge=1, description="keyframes after which a landmark must have trial_observations; ORB-SLAM3: 3")
+    trial_observations: int = Field(2, ge=2, description="observations a landmark must have by then")
+
+
+class BundleConfig(Section):
+    """Local and full bundle adjustment."""
+
+    local_keyframes: int = Field(12, ge=2, description="keyframes optimised with the new one")
+    fixed_keyframes: int = Field(20, ge=1, description="outer keyframes kept fixed at the most")
+    iterations: int = Field(10, ge=1, description="Levenberg-Marquardt steps a stage")
+    full_iterations: int = Field(30, ge=1, description="steps of the full adjustment at the end")
+    huber_px: float = Field(2.447, gt=0, description="px; sqrt(5.991)")
+    chi2_px2: float = Field(5.991, gt=0, description="px^2; observations beyond are outliers")
+
+
+class RelocalizationConfig(Section):
+    """What happens after tracking is lost."""
+
+    keyframes: int = Field(5, ge=1, description="last keyframes that a lost frame is matched to")
+    min_inliers: int = Field(30, ge=6, description="inliers of an accepted relocalisation")
+    new_map_after_frames: int = Field(5, ge=1, description="frames lost before a new map is begun beside the old one")
+
+
+class ThegraConfig(Section):
+    """The whole configuration; `config.yaml` of a run holds exactly this."""
+
+    profile: str = Field("quality", description="the profile the values started from")
+    seed: int = Field(0, ge=0, description="of every random choice")
+    weighting: Literal["normalized", "paper", "uniform"] = Field("normalized", description="observation weights from detection scores: over the keyframe's median; the literal score squared (paper Eq. 1); none")
+    preprocessing: PreprocessingConfig = PreprocessingConfig()
+    extractor: ExtractorConfig = ExtractorConfig()
+    matcher: MatcherConfig = MatcherConfig()
+    initialization: InitializationConfig = InitializationConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    keyframe: KeyframeConfig = KeyframeConfig()
+    mapping: MappingConfig = MappingConfig()
+    bundle: BundleConfig = BundleConfig()
+    relocalization: RelocalizationConfig = RelocalizationConfig()
+
+
+def load_config(profile: str | None = None, file: Path | None = None, overrides: dict[str, Any] | None = None) -> ThegraConfig:
+    """Profile, then file, then dotted overrides such as {"extractor.max_keypoints": "2048"}; later ones win.
+
+    A file may name the profile it builds on (`profile: fast`); `profile` given here wins over it.
+
+    Raises:
+        ConfigError: Naming the key and what it takes.
+    """
+    from_file = _read_yaml(file) if file is not None else {}
+    name = profile or from_file.get("profile") or "quality"
+    values = _merge(_profile_values(str(name)), from_file)
+    values["profile"] = name
+    for key, value in (overrides or {}).items():
+        _set_dotted(values, key, yaml.safe_load(value) if isinstance(value, str) else value)
+    try:
+        return ThegraConfig.model_validate(values)
+    except ValidationError as error:
+        lines = [f"  {'.'.join(str(part) for part in e['loc'])}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
+        raise ConfigError("configuration not understood:\n" + "\n".join(lines) + "\nlist the parameters with: thegra config") from error
+
+
+def dump_config(config: ThegraConfig) -> str:
+    """The configuration as YAML that `load_config` reads back to an equal one."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def _profile_values(name: str) -> dict[str, Any]:
+    if name not in PROFILES:
+        raise ConfigError(f"unknown profile {name!r}; known: {', '.join(PROFILES)}")
+    text = importlib.resources.files("thegra_core").joinpath(f"profiles/{name}.yaml").read_text(encoding="utf-8")
+    return yaml.safe_load(text) or {}
+
+
+def _read_yaml(file: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+    except OSError as error:
+        raise ConfigError(f"cannot read {file}: {error.strerror}") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{file} is not YAML: {error}") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{file} holds no key: value pairs at its top level")
+    return values
+
+
+def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in top.items():
+        merged[key] = _merge(merged[key], value) if isinstance(value, dict) and isinstance(merged.get(key), dict) else value
+    return merged
+
+
+def _set_dotted(values: dict[str, Any], key: str, value: Any) -> None:
+    *parents, last = key.split(".")
+    for parent in parents:
+        child = values.setdefault(parent, {})
+        if not isinstance(child, dict):
+            raise ConfigError(f"--set {key}: {parent} is no section")
+        values = child
+    values[last] = value
