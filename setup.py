@@ -1,0 +1,77 @@
+"""Installs `thegra_core`, `thegra_ros` and the command `thegra`, with pip or with colcon (build type ament_python)."""
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = "thegra_ros"
+ROOT = Path(__file__).resolve().parent
+MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
+
+REQUIRES = [
+    "numpy>=1.26",
+    "opencv-python-headless>=4.8",
+    "scikit-image>=0.22",
+    "gtsam>=4.2",
+    "rosbags>=0.11",
+    "mcap>=1.2",
+    "poselib>=2.0.4",
+    "pydantic>=2.7",
+    "PyYAML>=6.0",
+    "typer>=0.12",
+    "rich>=13",
+    "jinja2>=3.1",
+    "matplotlib>=3.8",
+    "kornia>=0.9,<0.10",
+    "torch>=2.2",
+]
+TEST = ["pytest>=8", "pytest-timeout>=2.2", "hypothesis>=6.100", "evo>=1.28", "pytransform3d>=3.5", "scipy>=1.11"]
+EXTRAS = {
+    "test": TEST,
+    "dev": [*TEST, "ruff>=0.5", "mypy>=1.10", "types-PyYAML", "import-linter>=2.1"],
+    "viz": ["rerun-sdk>=0.20"],
+    "ros": [
+        "ros-jazzy-rclpy",
+        "ros-jazzy-common-interfaces",
+        "ros-jazzy-lifecycle-msgs",
+        "ros-jazzy-rosgraph-msgs",
+        "ros-jazzy-rmw-fastrtps-cpp",
+    ],
+}
+
+
+def tree(target: str, folder: str, patterns: tuple[str, ...]) -> list[tuple[str, list[str]]]:
+    """`data_files` entries that install `folder` with its sub-folders under `target`."""
+    by_folder: dict[str, list[str]] = {}
+    for pattern in patterns:
+        for path in sorted((ROOT / folder).rglob(pattern)):
+            relative = path.relative_to(ROOT)
+            by_folder.setdefault(f"{target}/{relative.parent.as_posix()}", []).append(relative.as_posix())
+    return sorted(by_folder.items())
+
+
+setup(
+    name=PACKAGE,
+    version=MANIFEST.findtext("version"),
+    description="Monocular SLAM for thermal cameras with learned features, for ROS 2 and the command line",
+    long_description=(ROOT / "README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    license="Apache-2.0",
+    python_requires=">=3.10,<3.14",
+    packages=find_packages(include=["thegra_core", "thegra_core.*", "thegra_ros", "thegra_ros.*"]),
+    package_data={
+        "thegra_core": ["py.typed", "profiles/*.yaml", "**/*.j2", "**/*.css", "**/*.js"],
+        "thegra_ros": ["py.typed"],
+    },
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        *tree(f"share/{PACKAGE}", "launch", ("*.py",)),
+        *tree(f"share/{PACKAGE}", "config", ("*.yaml", "*.rviz", "*.xml", "*.json")),
+    ],
+    zip_safe=False,
+    install_requires=REQUIRES,
+    extras_require=EXTRAS,
+    entry_points={"console_scripts": ["thegra = thegra_core.cli.main:main"]},
+)
