@@ -1,0 +1,133 @@
+"""Image filters of the paper (Sec. III-B): pure functions from (H, W) uint8, uint16 or float32 to one of these.
+
+Every function leaves its input alone and accepts constant images.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from skimage.restoration import denoise_tv_chambolle
+
+from thegra_core.messages import ImageArray
+
+_LEVELS_16 = 65536
+
+
+def chambolle_tv(image: ImageArray, weight: float = 4.0, eps: float = 2e-4, max_iterations: int = 200) -> NDArray[np.float32]:
+    """Total-variation denoising (Chambolle 2004), to float32.
+
+    Args:
+        image: Any of the three types; values are taken as they are.
+        weight: Grey levels of `image`.
+        eps: Stops when the cost changes by less than this share of its first value.
+        max_iterations: At the most.
+    """
+    values = image.astype(np.float32)
+    if values.min() == values.max():
+        return values
+    return np.asarray(denoise_tv_chambolle(values, weight=weight, eps=eps, max_num_iter=max_iterations), dtype=np.float32)
+
+
+def he_clip(image: ImageArray, tail_fraction: float = 10000 / (640 * 512), fold: bool = False) -> NDArray[np.uint8]:
+    """Two-tail clip and linear map to uint8: the paper's "histogram equalisation, cumulative pixel count 10000".
+
+    The limits are the values at which the cumulative histogram, from below and from above, reaches `tail_fraction` of the pixels.
+    Value 0 marks missing pixels in an integer image and does not count from below; in a float image every pixel counts.
+
+    Args:
+        image: Any of the three types.
+        tail_fraction: Share of the pixels beyond each limit.
+        fold: Mirror what is below the lower limit instead of clamping it, as the authors' script did.
+    """
+    count = max(1, round(tail_fraction * image.size))
+    low, high = _limits_float(image, count) if image.dtype == np.float32 else _limits_integer(image, count)
+    return _map_linear(image, low, high, fold)
+
+
+def he_cdf(image: ImageArray) -> NDArray[np.uint8]:
+    """Histogram equalisation by the cumulative distribution, to uint8; float images are first put on 65536 levels between their extremes."""
+    if image.dtype == np.uint8:
+        return np.asarray(cv2.equalizeHist(image), dtype=np.uint8)
+    levels = _to_16_bit(image) if image.dtype == np.float32 else image
+    cumulative = np.cumsum(np.bincount(levels.ravel(), minlength=_LEVELS_16))
+    first = cumulative[levels.min()]
+    if first == levels.size:
+        return np.zeros(image.shape, np.uint8)
+    table = np.rint(np.maximum(cumulative - first, 0) * (255.0 / (levels.size - first))).astype(np.uint8)
+    return np.asarray(table[levels], dtype=np.uint8)
+
+
+def clahe(image: ImageArray, clip_limit: float = 2.0, tiles: int = 8) -> ImageArray:
+    """Contrast-limited adaptive histogram equalisation, uint8 to uint8; other types give uint16, float ones being first put on 65536 levels."""
+    levels = _to_16_bit(image) if image.dtype == np.float32 else image
+    result: ImageArray = cv2.createCLAHE(clip_limit, (tiles, tiles)).apply(levels)
+    return result
+
+
+def median(image: ImageArray, size: int = 3) -> ImageArray:
+    """Median of a size x size window, size 3 or 5; the type stays."""
+    result: ImageArray = cv2.medianBlur(image, size)
+    return result
+
+
+def band_pass(image: ImageArray, low: float = 0.0, high: float = 87.0) -> ImageArray:
+    """Keep the spatial frequencies whose distance from the centre of the spectrum is in [low, high] bins; then the magnitude.
+
+    uint8 stays uint8, other types give float32.
+    """
+    height, width = image.shape
+    v = np.fft.fftfreq(height, 1 / height)[:, None]
+    u = np.fft.rfftfreq(width, 1 / width)[None, :]
+    radius2 = u * u + v * v
+    spectrum = np.fft.rfft2(image.astype(np.float32))
+    spectrum[(radius2 < low * low) | (radius2 > high * high)] = 0
+    result = np.abs(np.fft.irfft2(spectrum, image.shape))
+    return np.clip(np.rint(result), 0, 255).astype(np.uint8) if image.dtype == np.uint8 else result.astype(np.float32)
+
+
+def bilateral(image: ImageArray, diameter: int = 4, sigma_color: float = 35.0, sigma_space: float = 35.0) -> ImageArray:
+    """Bilateral filter; uint8 stays uint8, other types give float32."""
+    values = image if image.dtype == np.uint8 else image.astype(np.float32)
+    result: ImageArray = cv2.bilateralFilter(values, diameter, sigma_color, sigma_space)
+    return result
+
+
+def stretch(image: ImageArray, low: float = 1.0, high: float = 99.0) -> NDArray[np.uint8]:
+    """Linear map of the values between two percentiles to uint8."""
+    below, above = np.percentile(image, [low, high])
+    return _map_linear(image, float(below), float(above), fold=False)
+
+
+def _limits_integer(image: ImageArray, count: int) -> tuple[float, float]:
+    histogram = np.bincount(image.ravel(), minlength=2)
+    from_above = np.cumsum(histogram[::-1])
+    high = len(histogram) - 1 - int(np.searchsorted(from_above, min(count, image.size)))
+    histogram[0] = 0
+    from_below = np.cumsum(histogram)
+    low = int(np.searchsorted(from_below, min(count, max(int(from_below[-1]), 1))))
+    return float(min(low, len(histogram) - 1)), float(high)
+
+
+def _limits_float(image: ImageArray, count: int) -> tuple[float, float]:
+    count = min(count, image.size)
+    ordered = np.partition(image.ravel(), (count - 1, image.size - count))
+    return float(ordered[count - 1]), float(ordered[image.size - count])
+
+
+def _map_linear(image: ImageArray, low: float, high: float, fold: bool) -> NDArray[np.uint8]:
+    if not high > low:
+        return np.where(image > high, np.uint8(255), np.uint8(0)).astype(np.uint8)
+    scale = 255.0 / (high - low)
+    values = (image.astype(np.float32) - np.float32(low)) * np.float32(scale)
+    if fold:
+        np.abs(values, out=values)
+    np.rint(values, out=values)
+    return np.clip(values, 0, 255, out=values).astype(np.uint8)
+
+
+def _to_16_bit(image: ImageArray) -> NDArray[np.uint16]:
+    low, high = float(image.min()), float(image.max())
+    scale = (_LEVELS_16 - 1) / (high - low) if high > low else 0.0
+    return np.rint((image.astype(np.float64) - low) * scale).astype(np.uint16)

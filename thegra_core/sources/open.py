@@ -1,0 +1,60 @@
+"""One call that opens whatever holds a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from thegra_core.errors import InputError
+from thegra_core.geometry.camera import CameraModel
+from thegra_core.sources.calibration import check_image_size, load_camera, missing_camera
+from thegra_core.sources.folder import find_list, open_images, open_list
+from thegra_core.sources.recording import Recording
+
+
+def open_recording(path: Path | str, topic: str | None = None) -> Recording:
+    """Open a recording: ROS 1 bag, rosbag2 folder, mcap or db3 file, image folder, or video.
+
+    Args:
+        path: The file or folder.
+        topic: Image topic of a bag; guessed when only one fits.
+
+    Raises:
+        InputError: If the path holds no recording or the topic is missing; the message lists the topics there are.
+    """
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise InputError(f"{path} does not exist")
+    if path.is_file() and path.suffix == ".txt":
+        return open_list(path)
+    image_list = find_list(path)
+    if image_list is not None:
+        return open_list(image_list)
+    return open_images(path)
+
+
+def camera_for(recording: Recording, file: Path | str | None = None, camera: str | None = None) -> CameraModel:
+    """The camera of a recording: from `file` when given (`FILE` or `FILE:cam1`), else its own; checked against its first image.
+
+    Raises:
+        InputError: If the recording holds no readable image.
+        CalibrationError: If nothing tells the intrinsics (the message shows a file to fill in) or they are for another image size.
+    """
+    first = next(iter(recording.frames()), None)
+    if first is None:
+        reasons = "".join(f"\n  {count} x {reason}" for reason, count in recording.problems.items())
+        raise InputError(f"no readable image in {recording.path}{reasons}\nlook at it with: thegra info {recording.path}")
+    height, width = first.image.shape
+    if file is not None:
+        path, picked = _split_camera(str(file))
+        model = load_camera(path, camera or picked, (width, height))
+    elif recording.camera is not None:
+        model = recording.camera
+    else:
+        raise missing_camera(str(recording.path), width, height)
+    check_image_size(model, first.image.shape)
+    return model
+
+
+def _split_camera(text: str) -> tuple[Path, str | None]:
+    head, _, tail = text.rpartition(":")
+    return (Path(head), tail) if head and not Path(text).exists() else (Path(text), None)
