@@ -1,0 +1,110 @@
+"""Motion-only bundle adjustment: the pose of one camera against fixed points (paper Sec. III-C, ORB-SLAM3's PoseOptimization)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from thegra_core.geometry import poses, triangulation
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+ROUNDS, STEPS = 4, 10
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEstimate:
+    """camera_from_world (4, 4); inliers (N,) bool of the observations given; covariance (6, 6) rotation first, of a perturbation in the camera frame."""
+
+    camera_from_world: FloatArray
+    inliers: BoolArray
+    covariance: FloatArray
+
+
+def pose_jacobian(points_camera: FloatArray) -> FloatArray:
+    """Derivatives (N, 2, 6) of the projections x/z, y/z by a left perturbation (rotation vector, translation) of camera_from_world."""
+    x, y, z = points_camera.T
+    inverse_z = 1.0 / z
+    u, v = x * inverse_z, y * inverse_z
+    zero = np.zeros_like(u)
+    return np.stack(
+        [
+            np.stack([-u * v, 1 + u * u, -v, inverse_z, zero, -u * inverse_z], axis=1),
+            np.stack([-(1 + v * v), u * v, u, zero, inverse_z, -v * inverse_z], axis=1),
+        ],
+        axis=1,
+    )
+
+
+def refine_pose(
+    camera_from_world: FloatArray,
+    points_world: FloatArray,
+    normalized: FloatArray,
+    focal: float,
+    weights: FloatArray,
+    gates: FloatArray,
+    chi2: float = 5.991,
+) -> PoseEstimate:
+    """Least robust weighted reprojection error over one pose.
+
+    Four rounds of at most ten Gauss-Newton steps; after each, observations beyond the gate sit out the next round; the Huber kernel is off in the last.
+    points_world (N, 3); normalized (N, 2) undistorted; focal in px turns their differences into pixels; weights (N,) 1/px^2; gates (N,) multiply
+    squared pixel residuals before they are compared with chi2 (px^2).
+    """
+    pose = camera_from_world
+    inliers = np.ones(len(points_world), dtype=bool)
+    hessian = np.eye(6)
+    for round_index in range(ROUNDS):
+        robust = round_index < ROUNDS - 1
+        pose, hessian = _gauss_newton(pose, points_world[inliers], normalized[inliers], focal, weights[inliers], np.sqrt(chi2) if robust else np.inf)
+        squared = (focal * triangulation.reprojection_errors(pose, points_world, normalized)) ** 2
+        inliers = gates * squared < chi2
+        if inliers.sum() < 4:
+            break
+    count = int(inliers.sum())
+    squared = (focal * triangulation.reprojection_errors(pose, points_world[inliers], normalized[inliers])) ** 2
+    variance = float((weights[inliers] * squared).sum() / max(2 * count - 6, 1)) if count else 1.0
+    covariance = max(variance, 1e-12) * np.linalg.pinv(hessian, hermitian=True)
+    return PoseEstimate(pose, inliers, covariance)
+
+
+def _gauss_newton(
+    pose: FloatArray, points_world: FloatArray, normalized: FloatArray, focal: float, weights: FloatArray, huber: float
+) -> tuple[FloatArray, FloatArray]:
+    hessian = np.eye(6)
+    for _ in range(STEPS):
+        points = poses.apply(pose, points_world)
+        front = points[:, 2] > 1e-9
+        if front.sum() < 3:
+            break
+        points = points[front]
+        residual = focal * (points[:, :2] / points[:, 2:] - normalized[front])
+        jacobian = focal * pose_jacobian(points)
+        length = np.sqrt(weights[front] * (residual**2).sum(axis=1))
+        w = weights[front] * np.minimum(1.0, huber / np.maximum(length, 1e-12))
+        weighted = jacobian * w[:, None, None]
+        hessian = np.einsum("nij,nik->jk", weighted, jacobian)
+        gradient = np.einsum("nij,ni->j", weighted, residual)
+        step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
+        pose = poses.transform(poses.so3_exp(step[:3]), step[3:]) @ pose
+        if float(np.abs(step).max()) < 1e-8:
+            break
+    return pose, hessian
+
+
+def estimate_pose(points_world: FloatArray, normalized: FloatArray, focal: float, threshold_px: float, seed: int) -> tuple[FloatArray, int]:
+    """camera_from_world (4, 4) without a starting pose, and its number of inliers, by PoseLib's locally optimised RANSAC (P3P).
+
+    points_world (N, 3) with N >= 4, normalized (N, 2) undistorted. 0 inliers: no pose found.
+    """
+    size = float(2 * focal * (np.abs(normalized).max() + 1))
+    camera = {"model": "SIMPLE_PINHOLE", "width": int(size), "height": int(size), "params": [focal, 0.0, 0.0]}
+    options = {"max_reproj_error": threshold_px, "seed": seed, "min_iterations": 100, "max_iterations": 2000, "success_prob": 0.9999}
+    found, info = poselib.estimate_absolute_pose(focal * normalized, points_world, camera, options, {})
+    pose = poses.transform(found.R, found.t)
+    if not np.all(np.isfinite(pose)):
+        return np.eye(4), 0
+    return pose, int(info["num_inliers"])
