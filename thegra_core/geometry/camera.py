@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum, unique
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,14 @@ class CameraModel:
     def focal(self) -> float:
         """Mean focal length (px)."""
         return float(np.sqrt(self.matrix[0, 0] * self.matrix[1, 1]))
+
+    @cached_property
+    def max_radius(self) -> float:
+        """Largest distance from the axis, on the plane z = 1, of any pixel on the image's edge."""
+        width, height = self.image_size
+        x, y = np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 33)
+        edge = np.concatenate([np.stack([x, np.full(33, v)], axis=1) for v in (0, height - 1)] + [np.stack([np.full(33, v), y], axis=1) for v in (0, width - 1)])
+        return float(np.nanmax(np.linalg.norm(self.undistort(edge), axis=1)))
 
     def project(self, points_camera: FloatArray) -> FloatArray:
         """Project points (N, 3) in the camera frame to raw pixels (N, 2); NaN where z <= 0."""

@@ -1,0 +1,223 @@
+"""The owner's way to change a map: every change goes through here, so that observations stay consistent and replicas hear of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thegra_core.geometry.camera import CameraModel
+from thegra_core.map.map import Map, make_keyframe
+from thegra_core.messages import NO_LANDMARK, Keyframe, KeyframeState, LandmarkArrays, MapUpdate
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class MapEditor:
+    """A map with its observations in both directions and the record of what changed since the last update.
+
+    `observers[landmark id]` is {keyframe id: keypoint index}, the mirror of the keyframes' `landmark_ids`; `visible` and `found` count
+    per landmark in how many frames it was predicted visible and found.
+    """
+
+    def __init__(self, map_id: int, camera: CameraModel, covisibility_threshold: int) -> None:
+        self.map = Map(map_id, camera)
+        self.observers: dict[int, dict[int, int]] = {}
+        self.visible: Counter[int] = Counter()
+        self.found: Counter[int] = Counter()
+        self.first_keyframe: dict[int, int] = {}
+        self._threshold = covisibility_threshold
+        self._next_landmark = 0
+        self._new: list[Keyframe] = []
+        self._keyframes: set[int] = set()
+        self._landmarks: set[int] = set()
+        self._removed: set[int] = set()
+        self._edges: set[int] = set()
+
+    # ---- changes --------------------------------------------------------------------------------------------------------------------
+
+    def add_keyframe(self, message: Keyframe) -> None:
+        """Insert a keyframe with those of its observations whose landmarks still live."""
+        keyframe = make_keyframe(message, self.map.camera)
+        wanted = keyframe.landmark_ids.copy()
+        keyframe.landmark_ids[:] = NO_LANDMARK
+        self.map.keyframes[message.id] = keyframe
+        self._new.append(message)
+        self._keyframes.add(message.id)
+        for index in np.flatnonzero(self.map.landmarks.rows(wanted) >= 0):
+            self.observe(int(wanted[index]), message.id, int(index))
+
+    def add_landmarks(self, points_world: FloatArray, keyframe_id: int) -> IntArray:
+        """New ids (N,) for points (N, 3), without observations yet; `keyframe_id` is where they were first seen."""
+        ids = np.arange(self._next_landmark, self._next_landmark + len(points_world), dtype=np.int64)
+        self._next_landmark += len(points_world)
+        template = next(iter(self.map.keyframes.values())).features.descriptors
+        self.map.landmarks.put(
+            LandmarkArrays(
+                ids=ids,
+                points_world=np.asarray(points_world, dtype=np.float64),
+                normals=np.zeros((len(ids), 3)),
+                depth_min=np.zeros(len(ids)),
+                depth_max=np.zeros(len(ids)),
+                descriptors=np.zeros((len(ids), template.shape[1]), dtype=template.dtype),
+                scores=np.zeros(len(ids), dtype=np.float32),
+            )
+        )
+        for landmark in ids.tolist():
+            self.observers[landmark] = {}
+            self.first_keyframe[landmark] = keyframe_id
+            self.visible[landmark] = self.found[landmark] = 1
+        self._landmarks.update(ids.tolist())
+        return ids
+
+    def observe(self, landmark: int, keyframe_id: int, feature: int) -> None:
+        """Say that a keypoint of a keyframe sees a landmark; ignored if either already has another partner there."""
+        ids = self.map.keyframes[keyframe_id].landmark_ids
+        if ids[feature] != NO_LANDMARK or keyframe_id in self.observers[landmark]:
+            return
+        ids[feature] = landmark
+        self.observers[landmark][keyframe_id] = feature
+        self._landmarks.add(landmark)
+        self._keyframes.add(keyframe_id)
+
+    def forget_observation(self, landmark: int, keyframe_id: int) -> None:
+        """Take one observation back; a landmark left with fewer than two is removed."""
+        observers = self.observers.get(landmark)
+        if observers is None or keyframe_id not in observers:
+            return
+        self.map.keyframes[keyframe_id].landmark_ids[observers.pop(keyframe_id)] = NO_LANDMARK
+        self._keyframes.add(keyframe_id)
+        self._landmarks.add(landmark)
+        if len(observers) < 2:
+            self.remove_landmarks([landmark])
+
+    def remove_landmarks(self, landmarks: Iterable[int]) -> None:
+        """Remove landmarks and all that observes them."""
+        gone = [landmark for landmark in landmarks if landmark in self.observers]
+        for landmark in gone:
+            for keyframe_id, feature in self.observers.pop(landmark).items():
+                self.map.keyframes[keyframe_id].landmark_ids[feature] = NO_LANDMARK
+                self._keyframes.add(keyframe_id)
+            self.first_keyframe.pop(landmark, None)
+            self.visible.pop(landmark, None)
+            self.found.pop(landmark, None)
+        self.map.landmarks.remove(np.array(gone, dtype=np.int64))
+        self._landmarks.difference_update(gone)
+        self._removed.update(gone)
+
+    def fuse(self, keep: int, drop: int) -> None:
+        """Two landmarks are one: move the observations of `drop` to `keep` where `keep` has none."""
+        if keep == drop or keep not in self.observers or drop not in self.observers:
+            return
+        moved = dict(self.observers[drop])
+        visible, found = self.visible[drop], self.found[drop]
+        self.remove_landmarks([drop])
+        for keyframe_id, feature in moved.items():
+            self.observe(keep, keyframe_id, feature)
+        self.visible[keep] += visible
+        self.found[keep] += found
+
+    def move(self, keyframe_ids: IntArray, world_from_camera: FloatArray, landmark_ids: IntArray, points_world: FloatArray) -> None:
+        """Set poses (K, 4, 4) and positions (L, 3), as bundle adjustment found them."""
+        for keyframe_id, pose in zip(keyframe_ids.tolist(), world_from_camera, strict=True):
+            self.map.keyframes[keyframe_id].world_from_camera = pose.copy()
+        self._keyframes.update(keyframe_ids.tolist())
+        rows = self.map.landmarks.rows(landmark_ids)
+        self.map.landmarks.points_world[rows[rows >= 0]] = points_world[rows >= 0]
+        self._landmarks.update(landmark_ids[rows >= 0].tolist())
+
+    # ---- questions ------------------------------------------------------------------------------------------------------------------
+
+    def observations(self, landmark_ids: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+        """All observations of the landmarks: index into `landmark_ids`, keyframe id, keypoint index, (M,) each, in a fixed order."""
+        triples = [
+            (index, keyframe_id, feature)
+            for index, landmark in enumerate(landmark_ids.tolist())
+            for keyframe_id, feature in sorted(self.observers.get(landmark, {}).items())
+        ]
+        table = np.array(triples, dtype=np.int64).reshape(-1, 3)
+        return table[:, 0], table[:, 1], table[:, 2]
+
+    def shared_landmarks(self, keyframe_id: int) -> Counter[int]:
+        """How many landmarks each other keyframe shares with this one."""
+        shared: Counter[int] = Counter()
+        ids = self.map.keyframes[keyframe_id].landmark_ids
+        for landmark in ids[ids != NO_LANDMARK].tolist():
+            shared.update(self.observers[landmark].keys())
+        shared.pop(keyframe_id, None)
+        return shared
+
+    # ---- derived data ---------------------------------------------------------------------------------------------------------------
+
+    def connect(self, keyframe_id: int) -> None:
+        """Renew a keyframe's edges: all that share at least the threshold of landmarks, or else the best one (ORB-SLAM3)."""
+        shared = self.shared_landmarks(keyframe_id)
+        ordered = sorted(shared.items(), key=lambda item: (-item[1], -item[0]))
+        edges = [item for item in ordered if item[1] >= self._threshold] or ordered[:1]
+        covisibility = self.map.covisibility
+        dropped = {other for other, _ in covisibility.get(keyframe_id, ())} - {other for other, _ in edges}
+        covisibility[keyframe_id] = tuple(edges)
+        self._edges.add(keyframe_id)
+        for other, count in [*edges, *((other, 0) for other in dropped)]:
+            theirs = [item for item in covisibility.get(other, ()) if item[0] != keyframe_id]
+            if count:
+                theirs.append((keyframe_id, count))
+            covisibility[other] = tuple(sorted(theirs, key=lambda item: (-item[1], -item[0])))
+            self._edges.add(other)
+
+    def refresh(self) -> None:
+        """Renew viewing direction, distance range, descriptor (of the newest observation) and score of every changed landmark."""
+        ids = np.array(sorted(self._landmarks), dtype=np.int64)
+        if len(ids) == 0:
+            return
+        index, keyframe_ids, features = self.observations(ids)
+        seen_by = sorted(set(keyframe_ids.tolist()))
+        position = {keyframe_id: row for row, keyframe_id in enumerate(seen_by)}
+        keyframe_row = np.array([position[i] for i in keyframe_ids.tolist()], dtype=np.int64)
+        centers = np.stack([self.map.keyframes[i].center for i in seen_by]) if seen_by else np.empty((0, 3))
+        store = self.map.landmarks
+        rows = store.rows(ids)
+        rays = store.points_world[rows][index] - centers[keyframe_row]
+        distance = np.linalg.norm(rays, axis=1)
+        normals = np.zeros((len(ids), 3))
+        np.add.at(normals, index, rays / np.maximum(distance, 1e-12)[:, None])
+        depth_min, depth_max = np.full(len(ids), np.inf), np.zeros(len(ids))
+        np.minimum.at(depth_min, index, distance)
+        np.maximum.at(depth_max, index, distance)
+        scores = np.zeros(len(ids))
+        for row, keyframe_id in enumerate(seen_by):
+            mask = keyframe_row == row
+            found = self.map.keyframes[keyframe_id].features
+            np.add.at(scores, index[mask], found.scores[features[mask]])
+            store.column("descriptors")[rows[index[mask]]] = found.descriptors[features[mask]]  # ascending keyframe ids: the newest stays
+        count = np.maximum(np.bincount(index, minlength=len(ids)), 1)
+        store.column("normals")[rows] = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
+        store.column("depth_min")[rows] = depth_min
+        store.column("depth_max")[rows] = depth_max
+        store.column("scores")[rows] = scores / count
+
+    def take_update(self, correction: FloatArray | None = None) -> MapUpdate:
+        """Everything that changed since the last call, as a message; derived data is renewed first."""
+        self.refresh()
+        self.map.version += 1
+        ids = np.array(sorted(self._landmarks), dtype=np.int64)
+        keyframes = tuple(
+            KeyframeState(i, self.map.keyframes[i].world_from_camera.copy(), self.map.keyframes[i].landmark_ids.copy()) for i in sorted(self._keyframes)
+        )
+        update = MapUpdate(
+            version=self.map.version,
+            map_id=self.map.map_id,
+            new_keyframes=tuple(self._new),
+            keyframes=keyframes,
+            landmarks=self.map.landmarks.get(ids) if len(ids) else None,
+            removed_landmark_ids=np.array(sorted(self._removed), dtype=np.int64),
+            covisibility={i: self.map.covisibility[i] for i in sorted(self._edges)},
+            correction=correction,
+        )
+        self._new = []
+        for changed in (self._keyframes, self._landmarks, self._removed, self._edges):
+            changed.clear()
+        return update
