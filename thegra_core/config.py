@@ -116,10 +116,10 @@ class PreprocessingConfig(Section):
 class ExtractorConfig(Section):
     """Keypoint detector and descriptor."""
 
-    name: Literal["superpoint", "aliked", "xfeat", "sift", "orb"] = "aliked"
+    name: Literal["superpoint", "aliked", "aliked-n16rot", "xfeat", "sift", "orb"] = "aliked"
     max_keypoints: int = Field(1024, ge=32, le=8192)
     detection_threshold: float = Field(0.0, ge=0, description="least score; 0: the strongest max_keypoints, whatever their score (measured: SuperPoint's own 0.0005 finds too few on thermal frames)")
-    nms_radius: int = Field(4, ge=1, le=32, description="px; SuperPoint's default")
+    nms_radius: int | None = Field(None, ge=1, le=32, description="px; none: what the network was published with (superpoint 4, aliked 2, xfeat 2); sift and orb have their own")
     border: int = Field(4, ge=0, le=64, description="px at the image's edge without keypoints")
     long_side: int | None = Field(None, ge=128, description="px; images are scaled so that the long side has this length before detection; none: as they are")
     device: str = Field("auto", description="auto, cpu, cuda, cuda:0, ...")

@@ -1,0 +1,36 @@
+"""Where the networks run."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from thegra_core.errors import ConfigError
+
+if TYPE_CHECKING:
+    import torch
+
+
+def resolve_device(name: str = "auto") -> torch.device:
+    """The torch device of that name; `auto` takes CUDA where there is a GPU.
+
+    Raises:
+        ConfigError: If the device does not exist here.
+    """
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ConfigError(f"unknown device {name!r}; use auto, cpu, cuda or cuda:0") from error
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise ConfigError(f"device {name!r} is not there ({torch.cuda.device_count()} CUDA devices); use: --set extractor.device=cpu --set matcher.device=cpu")
+    return device
+
+
+def use_threads(count: int) -> None:
+    """Let the networks use `count` CPU threads: a setting of the whole process, made only where the user or the command line asks for it."""
+    import torch
+
+    torch.set_num_threads(count)

@@ -1,0 +1,61 @@
+"""Mutual nearest neighbours with the ratio test (Lowe 2004), on float descriptors by angle and on binary ones by Hamming distance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thegra_core.config import MatcherConfig
+from thegra_core.errors import ConfigError
+from thegra_core.messages import Features, Matches
+
+
+class Nearest:
+    """`Matcher` without a network."""
+
+    def __init__(self, config: MatcherConfig) -> None:
+        self.name = "nearest"
+        self._ratio = config.ratio
+
+    def match(self, query: Features, reference: Features) -> Matches:
+        """See `Matcher.match`; the confidence is the similarity of the descriptors (cosine, or share of equal bits)."""
+        if query.extractor != reference.extractor:
+            raise ConfigError(f"features of {query.extractor} cannot be matched with features of {reference.extractor}")
+        if len(query) == 0 or len(reference) == 0:
+            return Matches(query.stamp_ns, reference.stamp_ns, np.empty((0, 2), np.int32), np.empty(0, np.float32))
+        distances, largest = _distances(query.descriptors, reference.descriptors)
+        indices = _mutual(distances, self._ratio)
+        confidence = 1 - distances[indices[:, 0], indices[:, 1]] ** (2 if largest is None else 1) / (largest or 2.0)
+        return Matches(query.stamp_ns, reference.stamp_ns, indices, np.clip(confidence, 0, 1).astype(np.float32))
+
+    def match_many(self, query: Features, references: Sequence[Features]) -> list[Matches]:
+        """See `Matcher.match_many`."""
+        return [self.match(query, reference) for reference in references]
+
+
+def _distances(
+    query: NDArray[np.float32] | NDArray[np.uint8], reference: NDArray[np.float32] | NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], float | None]:
+    """(N, M) Euclidean distances of unit vectors and None, or Hamming distances and the number of bits."""
+    if query.dtype == np.uint8:
+        bits = 8.0 * query.shape[1]
+        return np.asarray((bits - _signs(query) @ _signs(reference).T) / 2, np.float32), bits
+    return np.sqrt(np.maximum(2 - 2 * (query @ reference.T), 0)).astype(np.float32), None
+
+
+def _mutual(distances: NDArray[np.float32], ratio: float) -> NDArray[np.int32]:
+    """(M, 2) pairs that are nearest to each other and clearly nearer than the query's second nearest."""
+    rows = np.arange(len(distances))
+    best = distances.argmin(axis=1)
+    mutual = distances.argmin(axis=0)[best] == rows
+    if distances.shape[1] > 1 and ratio < 1:
+        second = np.partition(distances, 1, axis=1)[:, 1]
+        mutual &= distances[rows, best] < ratio * second
+    return np.stack((rows[mutual], best[mutual]), axis=1).astype(np.int32)
+
+
+def _signs(binary: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Bits as -1 and 1: their products count equal bits less unequal ones, exactly."""
+    return np.unpackbits(binary, axis=1).astype(np.float32) * 2 - 1

@@ -1,0 +1,88 @@
+"""SuperPoint (DeTone, Malisiewicz and Rabinovich, CVPR workshops 2018), written from the paper, for the authors' published weights.
+
+Keypoints are pixels of the 65-way cell classification, so they are integers; the descriptor map has one vector a cell of 8x8 pixels and is sampled
+bilinearly at the keypoints.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from thegra_core.config import ExtractorConfig
+from thegra_core.features.assemble import assemble, scaled_image
+from thegra_core.features.checkpoint import load_checkpoint, load_exactly
+from thegra_core.features.detection import strongest, suppress
+from thegra_core.features.device import resolve_device
+from thegra_core.messages import Features
+
+CELL = 8
+"""Pixels a side of the detector's cells: three max-poolings of two."""
+NMS_RADIUS = 4
+
+
+class SuperPoint:
+    """`Extractor` with the SuperPoint network."""
+
+    def __init__(self, config: ExtractorConfig) -> None:
+        self.name: str = config.name
+        self._config = config
+        self._device = resolve_device(config.device)
+        network = SuperPointNet()
+        load_exactly(network, load_checkpoint("superpoint_v1"), "superpoint_v1")
+        self._network = network.eval().to(self._device)
+
+    @torch.inference_mode()
+    def extract(self, image: NDArray[np.uint8], stamp_ns: int) -> Features:
+        """See `Extractor.extract`."""
+        config = self._config
+        scaled, scale = scaled_image(image, config.long_side)
+        grey = torch.from_numpy(scaled).to(self._device).float()[None, None] / 255
+        scores, descriptor_map = self._network(grey)
+        peaks = suppress(scores, config.nms_radius or NMS_RADIUS)
+        border = max(1, round(config.border * min(scale)))
+        keypoints, values = strongest(peaks[0], config.max_keypoints, config.detection_threshold, border)
+        descriptors = sample_descriptors(descriptor_map[0], keypoints)
+        return assemble(config, stamp_ns, (image.shape[1], image.shape[0]), scale, keypoints.cpu().numpy(), values.cpu().numpy(), descriptors.cpu().numpy())
+
+
+class SuperPointNet(nn.Module):
+    """The paper's network: a VGG encoder shared by a detector head (64 pixels of a cell and "no keypoint") and a descriptor head (256-D).
+
+    Layer names are those of the published checkpoint.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        for stage, (inside, outside) in enumerate(((1, 64), (64, 64), (64, 128), (128, 128)), start=1):
+            self.add_module(f"conv{stage}a", nn.Conv2d(inside, outside, 3, padding=1))
+            self.add_module(f"conv{stage}b", nn.Conv2d(outside, outside, 3, padding=1))
+        self.convPa, self.convPb = nn.Conv2d(128, 256, 3, padding=1), nn.Conv2d(256, CELL * CELL + 1, 1)
+        self.convDa, self.convDb = nn.Conv2d(128, 256, 3, padding=1), nn.Conv2d(256, 256, 1)
+
+    def forward(self, grey: Tensor) -> tuple[Tensor, Tensor]:
+        """Dense outputs of (B, 1, H, W) in [0, 1]: scores (B, H', W') of the pixels of whole cells, unit descriptors (B, 256, H'/8, W'/8)."""
+        x = grey
+        for stage in range(1, 5):
+            x = self.get_submodule(f"conv{stage}a")(x).relu_()
+            x = self.get_submodule(f"conv{stage}b")(x).relu_()
+            if stage < 4:
+                x = functional.max_pool2d(x, 2)
+        cells = self.convPb(self.convPa(x).relu_()).softmax(dim=1)[:, :-1]
+        descriptors = functional.normalize(self.convDb(self.convDa(x).relu_()), dim=1)
+        return functional.pixel_shuffle(cells, CELL)[:, 0], descriptors
+
+
+def sample_descriptors(descriptor_map: Tensor, keypoints: Tensor) -> Tensor:
+    """Unit descriptors (N, C) of keypoints (N, 2) px from a map (C, h, w) of 8x8 cells.
+
+    The grid is the one LightGlue was trained with: pixel s/2 - 1/2 is the centre of the first cell, and the last cell's centre is one pixel
+    further in than half a cell from the edge would have it (released SuperPoint and LightGlue code).
+    """
+    size = keypoints.new_tensor([descriptor_map.shape[-1], descriptor_map.shape[-2]])
+    grid = (keypoints - CELL / 2 + 0.5) / (size * CELL - CELL / 2 - 0.5) * 2 - 1
+    sampled = functional.grid_sample(descriptor_map[None], grid[None, None], mode="bilinear", align_corners=True)[0, :, 0]
+    return functional.normalize(sampled.t(), dim=1)
