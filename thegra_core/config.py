@@ -16,6 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from thegra_core.errors import ConfigError
 
 PROFILES = ("paper", "quality", "fast")
+RUN_FACTS = "run"
+"""Key of a run's `config.yaml` that tells what it was run on; no parameter."""
 
 
 class Section(BaseModel):
@@ -270,7 +272,7 @@ def _read_yaml(file: Path) -> dict[str, Any]:
         raise ConfigError(f"{file} is not YAML: {error}") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{file} holds no key: value pairs at its top level")
-    return values
+    return {key: value for key, value in values.items() if key != RUN_FACTS}
 
 
 def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,94 @@
+"""The command `thegra`: one sub-command a task; the work is imported only when its command runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from thegra_core.errors import ThegraError
+from thegra_core.version import VERSION
+
+EXIT_DONE, EXIT_NOTHING, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
+
+
+class _Group(TyperGroup):
+    """Shows errors that the user can do something about as one message instead of a traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except ThegraError as error:
+            typer.echo(f"thegra: {error}", err=True)
+            raise typer.Exit(EXIT_USAGE) from error
+        except KeyboardInterrupt as error:
+            typer.echo("thegra: interrupted", err=True)
+            raise typer.Exit(EXIT_INTERRUPTED) from error
+
+
+app = typer.Typer(
+    name="thegra",
+    cls=_Group,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app()
+
+
+def _print_version(value: bool) -> None:
+    if value:
+        typer.echo(f"thegra {VERSION}")
+        raise typer.Exit
+
+
+@app.callback()
+def thegra(version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")] = False) -> None:
+    """Monocular thermal SLAM: a recording in, a trajectory and a map out.
+
+    Start with: `thegra info recording.bag`, then `thegra run recording.bag`.
+    """
+
+
+@app.command()
+def run(
+    recording: Annotated[Path, typer.Argument(metavar="INPUT", help="ROS 1 or 2 bag, .mcap, image folder (with images.txt or plain) or video.")],
+    topic: Annotated[str | None, typer.Option(help="Image topic; guessed when only one fits.")] = None,
+    camera: Annotated[str | None, typer.Option(metavar="FILE", help="Camera calibration: ROS, Kalibr or OpenCV yaml, or fx,fy,cx,cy. Default: the recording's own.")] = None,
+    profile: Annotated[str | None, typer.Option(help="paper, quality or fast. Default: quality.")] = None,
+    config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with parameters; a run's config.yaml will do.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter, e.g. extractor.max_keypoints=2048; repeatable. `thegra config` lists them.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the results. Default: runs/INPUT_TIME.")] = None,
+    groundtruth: Annotated[Path | None, typer.Option(metavar="FILE", help="TUM trajectory to score against. Default: the one beside the input, if any.")] = None,
+    max_frames: Annotated[int | None, typer.Option(min=1, help="Stop after this many frames.")] = None,
+    start: Annotated[float, typer.Option(metavar="S", min=0.0, help="Seconds of the recording to skip.")] = 0.0,
+    duration: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="Seconds of the recording to process.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of every random choice. Default: the configuration's, 0.")] = None,
+    viewer: Annotated[str, typer.Option(help="none, or rerun to watch live.")] = "none",
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors and one final line only.")] = False,
+) -> None:
+    """Estimate the camera's trajectory and a map from a recording.
+
+    Example: `thegra run flight.mcap --camera camera.yaml --out runs/flight`
+
+    Exit code: 0 done, 1 nothing could be tracked, 2 wrong use or input, 130 interrupted (what is there is written).
+    """
+    from thegra_core.cli.run import RunOptions, run_recording
+
+    options = RunOptions(
+        recording=recording, topic=topic, camera=camera, profile=profile, config=config, assignments=tuple(set_ or ()), out=out,
+        groundtruth=groundtruth, max_frames=max_frames, start_s=start, duration_s=duration, seed=seed, viewer=viewer, quiet=quiet,
+    )  # fmt: skip
+    raise typer.Exit(run_recording(options))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""What `thegra run` shows: a progress bar while it runs, a table when it is done."""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import Any, Protocol
+
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
+from rich.table import Table
+
+from thegra_core.messages import TrackingResult, TrackingState
+from thegra_core.outputs.write import WrittenRun
+
+_COLOURS = {
+    TrackingState.TRACKING: "green",
+    TrackingState.HOLD: "cyan",
+    TrackingState.LOST: "red",
+    TrackingState.RELOCALIZING: "red",
+    TrackingState.INITIALIZING: "yellow",
+    TrackingState.WAITING: "yellow",
+}
+
+
+class Progress(Protocol):
+    """Told about each frame and stage; used as a context manager."""
+
+    def __enter__(self) -> Progress: ...
+    def __exit__(self, *exc: object) -> None: ...
+    def frame(self, result: TrackingResult, unreadable: int) -> None: ...
+    def stage(self, text: str) -> None: ...
+
+
+class Silent:
+    """Shows nothing."""
+
+    def __enter__(self) -> Silent:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        """Nothing."""
+
+    def frame(self, result: TrackingResult, unreadable: int) -> None:
+        """Nothing."""
+
+    def stage(self, text: str) -> None:
+        """Nothing."""
+
+
+class Bar:
+    """A bar with state, rate and map size; log lines, changes of state and reasons for waiting scroll above it."""
+
+    def __init__(self, console: Console, total: int | None) -> None:
+        self._console = console
+        self._bar = RichProgress(
+            TextColumn("{task.fields[state]}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[facts]}"),
+            TimeRemainingColumn(compact=True),
+            console=console,
+            transient=True,
+        )
+        self._task = self._bar.add_task("frames", total=total, state="starting", facts="")
+        self._handler = RichHandler(console=console, level=logging.WARNING, show_path=False, show_time=False, markup=False)
+        self._began = time.monotonic()
+        self._last: tuple[TrackingState | None, str] = (None, "")
+        self._frames = self._keyframes = 0
+
+    def __enter__(self) -> Bar:
+        logging.getLogger("thegra_core").addHandler(self._handler)
+        self._bar.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._bar.stop()
+        logging.getLogger("thegra_core").removeHandler(self._handler)
+
+    def frame(self, result: TrackingResult, unreadable: int) -> None:
+        """Advance by a frame, and say it when the state or the reason for waiting changes."""
+        self._frames += 1
+        self._keyframes += result.is_keyframe
+        if (result.state, result.reason) != self._last:
+            self._last = (result.state, result.reason)
+            self._console.print(f"  frame {self._frames}: {_coloured(result.state)}{': ' + result.reason if result.reason else ''}", highlight=False)
+        fps = self._frames / max(time.monotonic() - self._began, 1e-9)
+        problems = f" · {unreadable} unreadable" if unreadable else ""
+        facts = f"{fps:.1f} fps · {self._keyframes} keyframes · {result.visible} landmarks in view{problems}"
+        self._bar.update(self._task, advance=1, state=_coloured(result.state), facts=facts)
+
+    def stage(self, text: str) -> None:
+        """Name what goes on after the last frame."""
+        self._bar.update(self._task, state=text)
+
+
+def make_progress(quiet: bool, total: int | None) -> Progress:
+    """The bar on stderr, or nothing when quiet."""
+    return Silent() if quiet else Bar(Console(stderr=True), total)
+
+
+def print_summary(written: WrittenRun, quiet: bool, interrupted: bool) -> None:
+    """The final table, or one line when quiet."""
+    metrics = written.metrics
+    ate = f", ATE {metrics['ate_rmse']:.4g}" if metrics.get("ate_rmse") is not None else ""
+    head = f"{'interrupted: ' if interrupted else ''}{metrics['frames_tracked']} of {metrics['frames_total']} frames tracked ({metrics['tracked_pct']:g} %){ate}"
+    console = Console(stderr=False, highlight=False)
+    if quiet:
+        console.print(f"{head}; {written.folder}", soft_wrap=True, markup=False)
+        return
+    table = Table(title=head, show_header=False, title_justify="left")
+    for name, value in summary_rows(metrics):
+        table.add_row(name, value)
+    console.print(table)
+    console.print(f"trajectory  {written.folder / 'trajectory.txt'}\nreport      {written.report}", soft_wrap=True, markup=False)
+
+
+def summary_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """Name and value of what a user looks at first; the error always beside the coverage, which it means nothing without."""
+    rows = [
+        ("tracked", f"{metrics['tracked_pct']:g} % of {metrics['frames_total']} frames"),
+        ("ATE (Sim3)", _error(metrics)),
+        ("held / lost / initializing", f"{metrics['frames_held']} / {metrics['frames_lost']} / {metrics['frames_initializing']}"),
+        ("maps, keyframes, landmarks", f"{metrics['maps']}, {metrics['keyframes']}, {metrics['landmarks']}"),
+        ("losses, relocalizations", f"{metrics['losses']}, {metrics['relocalizations']}"),
+        ("speed", f"{metrics['fps']} fps, {metrics['ms_per_frame']['p50']} ms a frame (95 %: {metrics['ms_per_frame']['p95']})"),
+        ("memory", f"{metrics['peak_rss_mb']} MB"),
+    ]
+    if metrics["frames_bad"]:
+        rows.insert(3, ("bad frames", ", ".join(f"{count} {reason}" for reason, count in metrics["bad_frames"].items())))
+    return rows
+
+
+def _error(metrics: dict[str, Any]) -> str:
+    if "ate_rmse" not in metrics:
+        return "no ground truth"
+    if metrics["ate_rmse"] is None:
+        return "fewer than 3 frames with pose and ground truth"
+    return f"{metrics['ate_rmse']:.4g} over {metrics['ate_pairs']} frames; path {metrics['path_length']:.4g}"
+
+
+def _coloured(state: TrackingState) -> str:
+    return f"[{_COLOURS[state]}]{state.value}[/]"

@@ -1,0 +1,229 @@
+"""`thegra run`: frames of a recording through the system, results into a folder."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Protocol
+
+from thegra_core.cli.progress import Progress, make_progress, print_summary
+from thegra_core.config import ThegraConfig, load_config
+from thegra_core.errors import ConfigError, InputError
+from thegra_core.geometry.camera import CameraModel
+from thegra_core.messages import Frame, Run, Snapshot, TrackingResult
+from thegra_core.outputs.metrics import Timing
+from thegra_core.outputs.trajectory import NS_PER_S
+from thegra_core.outputs.viewer import Viewer, make_viewer
+from thegra_core.outputs.write import RecordingFacts, write_run
+from thegra_core.sources.open import camera_for, open_recording
+from thegra_core.sources.recording import Recording
+
+EXIT_DONE, EXIT_NOTHING, EXIT_INTERRUPTED = 0, 1, 130
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """The command's options; None: not given."""
+
+    recording: Path
+    topic: str | None = None
+    camera: str | None = None
+    profile: str | None = None
+    config: Path | None = None
+    assignments: tuple[str, ...] = ()
+    out: Path | None = None
+    groundtruth: Path | None = None
+    max_frames: int | None = None
+    start_s: float = 0.0
+    duration_s: float | None = None
+    seed: int | None = None
+    viewer: str = "none"
+    quiet: bool = False
+
+
+class System(Protocol):
+    """What the command needs of `slam.Slam`."""
+
+    def process(self, frame: Frame) -> TrackingResult: ...
+    def snapshot(self) -> Snapshot | None: ...
+    def finish(self, progress: Any = None) -> Run: ...
+
+
+@dataclass
+class _Progressed:
+    """How far the loop came, also when it is interrupted."""
+
+    frames: int = 0
+    interrupted: bool = False
+    unreadable: dict[str, int] = field(default_factory=dict)
+
+
+def run_recording(options: RunOptions) -> int:
+    """Run the system over a recording and write every output.
+
+    Returns:
+        The exit code: done, nothing tracked, or interrupted.
+
+    Raises:
+        ThegraError: If the input or an option cannot be used.
+    """
+    started = datetime.now(timezone.utc)
+    config = load_config(options.profile, options.config, _overrides(options))
+    recording = open_recording(options.recording, options.topic)
+    camera = camera_for(recording, options.camera)
+    groundtruth = _groundtruth(options, recording)
+    viewer = make_viewer(options.viewer)
+    out = options.out or Path("runs") / f"{recording.name}_{started:%Y%m%dT%H%M%SZ}"
+    with _log_file(out), make_progress(options.quiet, _expected_frames(options, recording)) as progress:
+        _log.info("%s: %s", recording.path, shlex.join(sys.argv))
+        for note in recording.notes:
+            _log.info("%s", note)
+        system = make_system(camera, config)
+        done, run, timing = _process(system, _window(recording, options), recording, progress, viewer)
+        viewer.finish(run)
+        facts = RecordingFacts(
+            name=recording.name, path=recording.path, topic=recording.topic, camera=camera, weights=_weights(config), problems=done.unreadable,
+            notes=tuple(recording.notes), command=shlex.join(["thegra", *sys.argv[1:]]), started_utc=f"{started:%Y-%m-%dT%H:%M:%SZ}",
+        )  # fmt: skip
+        progress.stage("writing the results")
+        written = write_run(run, out, config, facts, groundtruth, timing)
+    print_summary(written, options.quiet, done.interrupted)
+    if done.interrupted:
+        return EXIT_INTERRUPTED
+    return EXIT_DONE if written.metrics["frames_tracked"] else EXIT_NOTHING
+
+
+def make_system(camera: CameraModel, config: ThegraConfig) -> System:
+    """The SLAM system; imported here because the networks take seconds to load."""
+    from thegra_core.slam import Slam
+
+    system: System = Slam(camera, config)
+    return system
+
+
+def _process(system: System, frames: Iterator[Frame], recording: Recording, progress: Progress, viewer: Viewer) -> tuple[_Progressed, Run, Timing]:
+    done = _Progressed()
+    before = dict(recording.problems)
+    begin = time.perf_counter()
+    with _interrupt_after_frame() as interrupted:
+        try:
+            for frame in frames:
+                result = system.process(frame)
+                done.frames += 1
+                progress.frame(result, sum(recording.problems.values()))
+                viewer.show(result, system.snapshot)
+                if interrupted():
+                    done.interrupted = True
+                    break
+        except KeyboardInterrupt:
+            done.interrupted = True
+    wall = time.perf_counter() - begin
+    done.unreadable = {reason: count - before.get(reason, 0) for reason, count in recording.problems.items() if count > before.get(reason, 0)}
+    if done.interrupted:
+        _log.warning("interrupted after %d frames; finishing what is there", done.frames)
+    progress.stage("finishing the map")
+    begin = time.perf_counter()
+    run = system.finish()
+    return done, run, Timing(wall_s=wall, frames_read=done.frames, finish_s=time.perf_counter() - begin)
+
+
+@contextmanager
+def _interrupt_after_frame() -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C lets the current frame end, so that the map stays whole; the second is a KeyboardInterrupt at once."""
+    seen = False
+
+    def note(_signal: int, _frame: Any) -> None:
+        nonlocal seen
+        seen = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    try:
+        previous = signal.signal(signal.SIGINT, note)
+    except ValueError:  # not the main thread
+        yield lambda: False
+        return
+    try:
+        yield lambda: seen
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _window(recording: Recording, options: RunOptions) -> Iterator[Frame]:
+    """Frames of the wanted part; the time is counted from the first frame's stamp."""
+    first: int | None = None
+    given = 0
+    for frame in recording.frames():
+        first = frame.stamp_ns if first is None else first
+        offset_s = (frame.stamp_ns - first) / NS_PER_S
+        if offset_s < options.start_s:
+            continue
+        if options.duration_s is not None and offset_s >= options.start_s + options.duration_s:
+            return
+        yield frame
+        given += 1
+        if given == options.max_frames:
+            return
+
+
+def _expected_frames(options: RunOptions, recording: Recording) -> int | None:
+    known = recording.frame_count if options.start_s == 0 and options.duration_s is None else None
+    limits = [n for n in (known, options.max_frames) if n is not None]
+    return min(limits) if limits else None
+
+
+def _overrides(options: RunOptions) -> dict[str, Any]:
+    overrides: dict[str, Any] = {}
+    for assignment in options.assignments:
+        key, equals, value = assignment.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"--set {assignment}: write KEY=VALUE, e.g. --set extractor.max_keypoints=2048; the keys are listed by: thegra config")
+        overrides[key.strip()] = value
+    return overrides if options.seed is None else overrides | {"seed": options.seed}
+
+
+def _groundtruth(options: RunOptions, recording: Recording) -> Path | None:
+    if options.groundtruth is None:
+        return recording.groundtruth
+    if not options.groundtruth.is_file():
+        raise InputError(f"--groundtruth {options.groundtruth} does not exist; leave it out to run without scores")
+    return options.groundtruth
+
+
+def _weights(config: ThegraConfig) -> dict[str, str]:
+    from thegra_core.features.registry import weights_for
+    from thegra_core.features.weights import cache_dir, sha256_of, weight_named
+
+    files = [cache_dir() / weight_named(name).file for name in weights_for(config.extractor, config.matcher)]
+    return {file.name: sha256_of(file) for file in files if file.is_file()}
+
+
+@contextmanager
+def _log_file(out: Path) -> Iterator[None]:
+    logger = logging.getLogger("thegra_core")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        handler = logging.FileHandler(out / "thegra.log", mode="w", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot write to {out}: {error.strerror}; choose another folder with --out DIR") from error
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
+    level = logger.level
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    except Exception:
+        _log.exception("the run ended with an error")
+        raise
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+        handler.close()

@@ -1,0 +1,147 @@
+"""The figures of a run, flat and by the names that scripts rely on."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thegra_core.config import ThegraConfig
+from thegra_core.messages import FrameRecord, Run, TrackingState
+from thegra_core.outputs.scoring import Score, half_period, score_trajectory
+from thegra_core.outputs.trajectory import NS_PER_S, Trajectory, final_trajectory, live_trajectory
+from thegra_core.version import VERSION
+
+_LOST = (TrackingState.LOST, TrackingState.RELOCALIZING)
+_WAITING = (TrackingState.INITIALIZING, TrackingState.WAITING)
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """What the run cost.
+
+    wall_s covers all frames, without the work after the last one (`finish_s`); frames_read counts the frames that were handed to the system.
+    """
+
+    wall_s: float
+    frames_read: int
+    finish_s: float = 0.0
+    dropped_frames: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class RunScores:
+    """Scores of the main map: from the finished map, and as estimated at the time."""
+
+    final: Score
+    live: Score
+
+
+def score_run(run: Run, groundtruth: Trajectory) -> RunScores:
+    """Score the main map against the part of the ground truth that the frames span."""
+    stamps = np.unique(np.array([f.stamp_ns for f in run.frames], np.int64))
+    truth = _within(groundtruth, stamps)
+    final = score_trajectory(final_trajectory(run, run.main_map_id), truth, stamps)
+    live = score_trajectory(live_trajectory(run, run.main_map_id), truth, stamps)
+    return RunScores(final, live)
+
+
+def run_metrics(
+    run: Run, config: ThegraConfig, timing: Timing, scores: RunScores | None = None, unreadable: Mapping[str, int] | None = None
+) -> dict[str, Any]:
+    """Everything `metrics.json` holds; the keys for ground truth are there only when it was given.
+
+    `unreadable` counts images that the recording holds but nobody could read, by reason; they count among all frames, and as bad.
+    """
+    tracked = [f for f in run.frames if f.world_from_camera is not None]
+    in_main = sum(f.map_id == run.main_map_id for f in tracked)
+    bad = dict(Counter(run.bad_frames) + Counter(unreadable or {}))
+    total = max(timing.frames_read, len(run.frames)) + sum((unreadable or {}).values())
+    metrics: dict[str, Any] = {
+        "frames_total": total,
+        "frames_tracked": in_main,
+        "frames_tracked_other_maps": len(tracked) - in_main,
+        "frames_localized_afterwards": sum(f.localized_afterwards for f in tracked),
+        "frames_held": _count(run.frames, (TrackingState.HOLD,)),
+        "frames_lost": _count(run.frames, _LOST),
+        "frames_initializing": _count(run.frames, _WAITING),
+        "frames_bad": sum(bad.values()),
+        "bad_frames": bad,
+        "tracked_pct": _percent(in_main, total),
+        "tracked_any_pct": _percent(len(tracked), total),
+        "maps": len(run.maps),
+        "keyframes": sum(len(m.keyframe_stamps_ns) for m in run.maps),
+        "landmarks": sum(len(m.points_world) for m in run.maps),
+        "losses": run.losses,
+        "relocalizations": run.relocalizations,
+        "loops": run.loops,
+        "merges": run.merges,
+        "shutter_closures": [[begin / NS_PER_S, end / NS_PER_S] for begin, end in run.shutter_closures_ns],
+    }
+    return metrics | (_score_metrics(scores) if scores else {}) | _time_metrics(run, timing) | {"seed": config.seed, "profile": config.profile, "version": VERSION}
+
+
+def peak_rss_mb() -> float:
+    """Largest resident memory of this process so far, MiB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20) if sys.platform == "darwin" else peak / 1024
+
+
+def percentiles(values: Sequence[float] | np.ndarray[Any, Any], which: Iterable[int]) -> dict[str, float | None]:
+    """{"p50": ..., ...}; None each when there are no values."""
+    return {f"p{p}": round(float(np.percentile(values, p)), 3) if len(values) else None for p in which}
+
+
+def _score_metrics(scores: RunScores) -> dict[str, Any]:
+    final = scores.final
+    return {
+        "ate_rmse": final.ate_rmse,
+        "ate_live_rmse": scores.live.ate_rmse,
+        "ate_scale": final.scale,
+        "path_length": final.path_length,
+        "ate_pct": final.ate_pct,
+        "ate_rel": final.ate_rel,
+        "ate_pairs": final.pairs,
+        "ate_median": final.ate_median,
+        "ate_max": final.ate_max,
+        "rot_deg": final.rot_deg,
+        "recall_1pct": final.recall_1pct,
+    }
+
+
+def _time_metrics(run: Run, timing: Timing) -> dict[str, Any]:
+    stages: dict[str, list[float]] = {}
+    for frame in run.frames:
+        for stage, ms in frame.result.stage_ms.items():
+            stages.setdefault(stage, []).append(ms)
+    frame_ms = [sum(f.result.stage_ms.values()) for f in run.frames if f.result.stage_ms]
+    return {
+        "fps": round(timing.frames_read / timing.wall_s, 3) if timing.wall_s > 0 else None,
+        "ms_per_frame": percentiles(frame_ms, (50, 95, 99)),
+        "ms": {stage: percentiles(values, (50, 95)) for stage, values in stages.items()},
+        "wall_s": round(timing.wall_s, 3),
+        "finish_s": round(timing.finish_s, 3),
+        "dropped_frames": timing.dropped_frames,
+        "peak_rss_mb": round(peak_rss_mb(), 1),
+    }
+
+
+def _count(frames: Iterable[FrameRecord], states: tuple[TrackingState, ...]) -> int:
+    return sum(f.world_from_camera is None and f.result.state in states for f in frames)
+
+
+def _percent(part: int, whole: int) -> float:
+    return round(100.0 * part / whole, 2) if whole else 0.0
+
+
+def _within(trajectory: Trajectory, stamps_ns: np.ndarray[Any, np.dtype[np.int64]]) -> Trajectory:
+    if len(stamps_ns) == 0:
+        return trajectory
+    margin = half_period(stamps_ns)
+    inside = (trajectory.stamps_ns >= stamps_ns[0] - margin) & (trajectory.stamps_ns <= stamps_ns[-1] + margin)
+    return Trajectory(trajectory.stamps_ns[inside], trajectory.poses[inside])
