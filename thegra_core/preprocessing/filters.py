@@ -5,6 +5,8 @@ Every function leaves its input alone and accepts constant images.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -62,13 +64,13 @@ def he_cdf(image: ImageArray) -> NDArray[np.uint8]:
 def clahe(image: ImageArray, clip_limit: float = 2.0, tiles: int = 8) -> ImageArray:
     """Contrast-limited adaptive histogram equalisation, uint8 to uint8; other types give uint16, float ones being first put on 65536 levels."""
     levels = _to_16_bit(image) if image.dtype == np.float32 else image
-    result: ImageArray = cv2.createCLAHE(clip_limit, (tiles, tiles)).apply(levels)
+    result: NDArray[Any] = cv2.createCLAHE(clip_limit, (tiles, tiles)).apply(levels)
     return result
 
 
 def median(image: ImageArray, size: int = 3) -> ImageArray:
     """Median of a size x size window, size 3 or 5; the type stays."""
-    result: ImageArray = cv2.medianBlur(image, size)
+    result: NDArray[Any] = cv2.medianBlur(image, size)
     return result
 
 
@@ -90,7 +92,7 @@ def band_pass(image: ImageArray, low: float = 0.0, high: float = 87.0) -> ImageA
 def bilateral(image: ImageArray, diameter: int = 4, sigma_color: float = 35.0, sigma_space: float = 35.0) -> ImageArray:
     """Bilateral filter; uint8 stays uint8, other types give float32."""
     values = image if image.dtype == np.uint8 else image.astype(np.float32)
-    result: ImageArray = cv2.bilateralFilter(values, diameter, sigma_color, sigma_space)
+    result: NDArray[Any] = cv2.bilateralFilter(values, diameter, sigma_color, sigma_space)
     return result
 
 

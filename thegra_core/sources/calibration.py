@@ -202,7 +202,7 @@ def _floats(value: Any, path: Path) -> list[float]:
         raise CalibrationError(f"{path}: {value!r} are no numbers; fill in the capitals of the template") from error
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """Also reads OpenCV's matrices."""
 
 
@@ -212,7 +212,7 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", lambda loader, node: 
 def _parse_yaml(text: str, path: Path) -> dict[str, Any]:
     body = re.sub(r"\A\ufeff?%YAML:?\s*[\d.]+\s*\n", "", text)
     try:
-        values = yaml.load(body, Loader=_Loader)  # noqa: S506 (a SafeLoader)
+        values = yaml.load(body, Loader=_Loader)  # a SafeLoader
     except yaml.YAMLError as error:
         raise CalibrationError(f"{path} is not YAML ({error}); understood are: {_FORMS}") from error
     if not isinstance(values, dict):

@@ -9,7 +9,7 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 from thegra_core.errors import InputError
-from thegra_core.messages import Frame
+from thegra_core.messages import Frame, ImageArray
 from thegra_core.sources.calibration import camera_beside
 from thegra_core.sources.image_decoding import DecodeError, decode_compressed
 from thegra_core.sources.recording import Source
@@ -30,14 +30,18 @@ class FolderRecording(Source):
         """Every image that can be read; the others are counted in `problems`."""
         self.problems.clear()
         for index, (stamp_ns, file) in enumerate(self.entries):
-            try:
-                image = decode_compressed(file.read_bytes())
-            except OSError:
-                self.problems["image file missing or unreadable"] += 1
-            except DecodeError as error:
-                self.problems[str(error)] += 1
-            else:
+            image = self._read(file)
+            if image is not None:
                 yield Frame(stamp_ns, index, image)
+
+    def _read(self, file: Path) -> ImageArray | None:
+        try:
+            return decode_compressed(file.read_bytes())
+        except OSError:
+            self.problems["image file missing or unreadable"] += 1
+        except DecodeError as error:
+            self.problems[str(error)] += 1
+        return None
 
 
 def find_list(folder: Path) -> Path | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from thegra_core.messages import ImageArray
 MAX_NOT_FINITE = 0.1
 """Share of NaN or infinite pixels above which a float image is refused; fewer are set to the image's median."""
 
-_DTYPES = {"8": np.dtype(np.uint8), "16U": np.dtype(np.uint16), "16S": np.dtype(np.int16), "32F": np.dtype(np.float32)}
+_DTYPES: dict[str, np.dtype[Any]] = {"8": np.dtype(np.uint8), "16U": np.dtype(np.uint16), "16S": np.dtype(np.int16), "32F": np.dtype(np.float32)}
 _RAW = {
     "mono8": ("8", 1), "8uc1": ("8", 1), "8uc3": ("8", 3), "8uc4": ("8", 4), "rgb8": ("8", 3), "bgr8": ("8", 3), "rgba8": ("8", 4), "bgra8": ("8", 4),
     "mono16": ("16U", 1), "16uc1": ("16U", 1), "16sc1": ("16S", 1), "rgb16": ("16U", 3), "bgr16": ("16U", 3), "32fc1": ("32F", 1),
@@ -76,9 +77,11 @@ def from_array(image: NDArray[np.generic]) -> ImageArray:
         DecodeError: If the type or the number of channels is another, or a float image is not finite.
     """
     channels = 1 if image.ndim == 2 else image.shape[2]
+    if image.size == 0:
+        raise DecodeError("image of zero size")
     if image.dtype == np.float64:
         image = image.astype(np.float32)
-    if image.dtype not in _DTYPES.values() or channels not in (1, 3, 4):
+    if image.dtype not in _DTYPES.values() or channels not in (1, 3, 4) or (channels > 1 and image.dtype == np.int16):
         raise DecodeError(f"image with {channels} channels of {image.dtype}")
     return _single_channel(image.reshape(*image.shape[:2], channels), "bgr")
 
@@ -108,8 +111,8 @@ def _single_channel(pixels: NDArray[np.generic], encoding: str) -> ImageArray:
 
 def _luma(pixels: NDArray[np.generic], rgb: bool) -> ImageArray:
     code = {(3, False): cv2.COLOR_BGR2GRAY, (3, True): cv2.COLOR_RGB2GRAY, (4, False): cv2.COLOR_BGRA2GRAY, (4, True): cv2.COLOR_RGBA2GRAY}
-    gray = cv2.cvtColor(np.ascontiguousarray(pixels), code[pixels.shape[2], rgb])
-    return _finite(gray) if gray.dtype == np.float32 else np.asarray(gray, dtype=gray.dtype)
+    gray: NDArray[Any] = cv2.cvtColor(np.ascontiguousarray(pixels), code[pixels.shape[2], rgb])
+    return _finite(gray) if gray.dtype == np.float32 else gray
 
 
 def _finite(plane: NDArray[np.generic]) -> NDArray[np.float32]:

@@ -6,9 +6,15 @@ from pathlib import Path
 
 from thegra_core.errors import InputError
 from thegra_core.geometry.camera import CameraModel
+from thegra_core.sources.bag import bag_image_topics, open_bag
+from thegra_core.sources.bag_files import is_bag
 from thegra_core.sources.calibration import check_image_size, load_camera, missing_camera
 from thegra_core.sources.folder import find_list, open_images, open_list
-from thegra_core.sources.recording import Recording
+from thegra_core.sources.recording import ImageTopic, Recording
+from thegra_core.sources.video import SUFFIXES as VIDEO_SUFFIXES
+from thegra_core.sources.video import open_video
+
+FORMS = "a ROS 1 .bag, a rosbag2 folder, an .mcap or .db3 file, a folder with images.txt or images, or a video"
 
 
 def open_recording(path: Path | str, topic: str | None = None) -> Recording:
@@ -21,15 +27,29 @@ def open_recording(path: Path | str, topic: str | None = None) -> Recording:
     Raises:
         InputError: If the path holds no recording or the topic is missing; the message lists the topics there are.
     """
-    path = Path(path).expanduser()
-    if not path.exists():
-        raise InputError(f"{path} does not exist")
-    if path.is_file() and path.suffix == ".txt":
+    path = _existing(path)
+    if _holds_bag(path):
+        return open_bag(path, topic)
+    if topic is not None:
+        raise InputError(f"--topic {topic} is given but {path} is no bag and has no topics; leave it out")
+    if path.is_dir():
+        image_list = find_list(path)
+        return open_list(image_list) if image_list is not None else open_images(path)
+    if path.suffix.lower() == ".txt":
         return open_list(path)
-    image_list = find_list(path)
-    if image_list is not None:
-        return open_list(image_list)
-    return open_images(path)
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return open_video(path)
+    raise InputError(f"{path} is {'empty' if path.stat().st_size == 0 else 'no recording'}; give {FORMS}")
+
+
+def image_topics(path: Path | str) -> list[ImageTopic]:
+    """The image topics of a bag; none for folders and videos.
+
+    Raises:
+        InputError: If the path does not exist or a bag cannot be read at all.
+    """
+    path = _existing(path)
+    return bag_image_topics(path) if _holds_bag(path) else []
 
 
 def camera_for(recording: Recording, file: Path | str | None = None, camera: str | None = None) -> CameraModel:
@@ -53,6 +73,19 @@ def camera_for(recording: Recording, file: Path | str | None = None, camera: str
         raise missing_camera(str(recording.path), width, height)
     check_image_size(model, first.image.shape)
     return model
+
+
+def _existing(path: Path | str) -> Path:
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise InputError(f"{path} does not exist; give {FORMS}")
+    return path
+
+
+def _holds_bag(path: Path) -> bool:
+    if path.is_file():
+        return is_bag(path)
+    return (path / "metadata.yaml").is_file() or (find_list(path) is None and any(f.is_file() and is_bag(f) for f in path.iterdir()))
 
 
 def _split_camera(text: str) -> tuple[Path, str | None]:
