@@ -185,6 +185,7 @@ class MappingConfig(Section):
 
     covisibility_threshold: int = Field(15, ge=1, description="shared landmarks that make an edge; ORB-SLAM3: 15")
     neighbours: int = Field(4, ge=1, le=30, description="covisible keyframes that a new keyframe is matched to; ORB-SLAM3: 30, with learned matching each costs a network run")
+    min_baseline_ratio: float = Field(0.01, ge=0, description="distance to a neighbour over median depth below which nothing is triangulated with it; ORB-SLAM3: 0.01")
     epipolar_px: float = Field(2.0, gt=0, description="px to the epipolar line; chi-square 3.84 at 1 px is 1.96 px")
     min_parallax_deg: float = Field(1.0, gt=0, description="degrees between the rays of a new point; ORB-SLAM3: 1.15")
     max_reprojection_px: float = Field(2.0, gt=0, description="px")

@@ -129,6 +129,11 @@ class MapEditor:
         self.map.landmarks.points_world[rows[rows >= 0]] = points_world[rows >= 0]
         self._landmarks.update(landmark_ids[rows >= 0].tolist())
 
+    @property
+    def next_landmark(self) -> int:
+        """The id that the next new landmark will get."""
+        return self._next_landmark
+
     # ---- questions ------------------------------------------------------------------------------------------------------------------
 
     def observations(self, landmark_ids: IntArray) -> tuple[IntArray, IntArray, IntArray]:

@@ -97,6 +97,7 @@ def _solve(
             graph.add(gtsam.PriorFactorPose3(X(int(row)), pose, held))
     for row in point_rows:
         values.insert(P(int(row)), points_world[row])
+    _hold_scale(graph, world_from_camera, problem.fixed, keyframe_rows)
     _add_projections(graph, problem, used, huber_px)
 
     ordering = gtsam.Ordering()
@@ -120,6 +121,18 @@ def _solve(
     for row in point_rows:
         points[row] = result.atPoint3(P(int(row)))
     return camera, points
+
+
+def _hold_scale(graph: gtsam.NonlinearFactorGraph, world_from_camera: FloatArray, fixed: BoolArray, keyframe_rows: IntArray) -> None:
+    """With a single fixed pose the scale is free: keep the distance from it to the farthest other pose."""
+    held = keyframe_rows[fixed[keyframe_rows]]
+    if len(held) != 1:
+        return
+    distance = np.linalg.norm(world_from_camera[keyframe_rows, :3, 3] - world_from_camera[held[0], :3, 3], axis=1)
+    far = int(np.argmax(distance))
+    if distance[far] > 0:
+        model = gtsam.noiseModel.Isotropic.Sigma(1, 1e-6 * float(distance[far]))
+        graph.add(gtsam.RangeFactorPose3(X(int(held[0])), X(int(keyframe_rows[far])), float(distance[far]), model))
 
 
 def _add_projections(graph: gtsam.NonlinearFactorGraph, problem: BundleProblem, used: BoolArray, huber_px: float) -> None:

@@ -1,0 +1,115 @@
+"""The mapping stage: owns the maps, grows and adjusts them, and tells tracking what changed."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from thegra_core.config import ThegraConfig
+from thegra_core.features.protocols import Matcher
+from thegra_core.geometry.camera import CameraModel
+from thegra_core.map.editor import MapEditor
+from thegra_core.mapping import culling
+from thegra_core.mapping.adjustment import adjust_all, adjust_locally
+from thegra_core.mapping.expansion import expand
+from thegra_core.messages import InitialMap, Keyframe, MapSummary, MapUpdate, Matches
+
+logger = logging.getLogger(__name__)
+
+
+class Mapper:
+    """Keyframes in, map updates out (paper Sec. III-C). Not thread-safe: one caller at a time."""
+
+    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher) -> None:
+        self._camera = camera
+        self._config = config
+        self._matcher = matcher
+        self._editors: dict[int, MapEditor] = {}
+        self._trial: dict[int, list[int]] = {}
+
+    def initialize(self, initial: InitialMap) -> MapUpdate:
+        """Begin a map from what the initializer solved; its bundle adjustment has been done."""
+        editor = MapEditor(initial.map_id, self._camera, self._config.mapping.covisibility_threshold)
+        self._editors[initial.map_id] = editor
+        for message in initial.keyframes:
+            editor.add_keyframe(message)
+        ids = editor.add_landmarks(initial.points_world, initial.keyframes[-1].id)
+        for message in initial.keyframes:
+            for feature in np.flatnonzero(message.landmark_ids >= 0).tolist():
+                editor.observe(int(ids[message.landmark_ids[feature]]), message.id, feature)
+        editor.remove_landmarks([i for i in ids.tolist() if len(editor.observers[i]) < 2])
+        for message in initial.keyframes:
+            editor.connect(message.id)
+        self._trial[initial.map_id] = []
+        logger.info("map %d begins with %d keyframes and %d landmarks", initial.map_id, len(initial.keyframes), len(editor.map.landmarks))
+        return editor.take_update()
+
+    def insert(self, keyframe: Keyframe) -> MapUpdate:
+        """Insert a keyframe: observations, culling, expansion with its neighbours, local bundle adjustment."""
+        editor = self._editors[keyframe.map_id]
+        editor.add_keyframe(keyframe)
+        editor.connect(keyframe.id)
+        self._cull(editor, keyframe)
+        self._expand(editor, keyframe)
+        editor.connect(keyframe.id)
+        adjust_locally(editor, keyframe.id, self._config)
+        editor.connect(keyframe.id)
+        return editor.take_update()
+
+    def finish(self, map_id: int) -> MapUpdate:
+        """Full bundle adjustment of a map at the end of a run."""
+        editor = self._editors[map_id]
+        adjust_all(editor, self._config)
+        return editor.take_update()
+
+    @property
+    def map_ids(self) -> list[int]:
+        return sorted(self._editors)
+
+    def summary(self, map_id: int) -> MapSummary:
+        """A copy of what a finished map holds, for outputs."""
+        current = self._editors[map_id].map
+        keyframes = [current.keyframes[i] for i in sorted(current.keyframes)]
+        landmarks = current.landmarks.get(current.landmarks.alive_ids()) if len(current.landmarks) else None
+        return MapSummary(
+            map_id=map_id,
+            keyframe_stamps_ns=np.array([k.stamp_ns for k in keyframes], dtype=np.int64),
+            keyframe_poses=np.array([k.world_from_camera for k in keyframes]).reshape(-1, 4, 4),
+            points_world=landmarks.points_world if landmarks is not None else np.empty((0, 3)),
+            point_scores=landmarks.scores if landmarks is not None else np.empty(0, np.float32),
+        )
+
+    def _cull(self, editor: MapEditor, keyframe: Keyframe) -> None:
+        trial = self._trial[keyframe.map_id]
+        if keyframe.seen is not None:
+            concerned = culling.count_visibility(editor, keyframe.seen)
+            editor.remove_landmarks(culling.untrackable(editor, concerned, self._config.mapping))
+        remove, self._trial[keyframe.map_id] = culling.failed_trial(editor, trial, keyframe.id, self._config.mapping)
+        editor.remove_landmarks(remove)
+
+    def _expand(self, editor: MapEditor, keyframe: Keyframe) -> None:
+        """Match the keyframe to its neighbours, the reference first, whose matches tracking already has."""
+        neighbours = self._choose_neighbours(editor, keyframe)
+        features = keyframe.features
+        known: dict[int, Matches] = {}
+        if keyframe.reference_matches is not None:
+            known[keyframe.reference_id] = keyframe.reference_matches
+        open_ids = [i for i in neighbours if i not in known]
+        matched = self._matcher.match_many(features, [editor.map.keyframes[i].features for i in open_ids])
+        known.update(zip(open_ids, matched, strict=True))
+        before = editor.next_landmark
+        for neighbour in neighbours:
+            expand(editor, keyframe.id, neighbour, known[neighbour], self._config.mapping)
+        self._trial[keyframe.map_id].extend(range(before, editor.next_landmark))
+
+    def _choose_neighbours(self, editor: MapEditor, keyframe: Keyframe) -> list[int]:
+        """The reference and the best covisible keyframes, every one far enough away for its baseline to say something."""
+        candidates = editor.map.neighbours(keyframe.id, 3 * self._config.mapping.neighbours)
+        if keyframe.reference_id in editor.map.keyframes:
+            candidates = [keyframe.reference_id, *(i for i in candidates if i != keyframe.reference_id)]
+        depth = editor.map.median_depth(keyframe.id)
+        center = editor.map.keyframes[keyframe.id].center
+        least = self._config.mapping.min_baseline_ratio * depth if np.isfinite(depth) else 0.0
+        far = [i for i in candidates if np.linalg.norm(editor.map.keyframes[i].center - center) >= least]
+        return far[: self._config.mapping.neighbours]

@@ -1,0 +1,50 @@
+"""Constant-velocity motion, in frame periods so that 30 Hz video and photo flights behave alike."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thegra_core.geometry import poses
+
+FloatArray = NDArray[np.float64]
+
+
+class MotionModel:
+    """Remembers the last two poses and extrapolates them."""
+
+    def __init__(self) -> None:
+        self._previous: tuple[int, FloatArray] | None = None
+        self._last: tuple[int, FloatArray] | None = None
+
+    def update(self, stamp_ns: int, world_from_camera: FloatArray) -> None:
+        """Add an estimated pose (4, 4); stamps must ascend."""
+        self._previous, self._last = self._last, (stamp_ns, world_from_camera)
+
+    def reset(self) -> None:
+        """Forget all poses."""
+        self._previous = self._last = None
+
+    def move(self, new_world_from_world: FloatArray) -> None:
+        """The world was corrected: carry the remembered poses along with a rigid transform (4, 4)."""
+        if self._previous is not None:
+            self._previous = (self._previous[0], new_world_from_world @ self._previous[1])
+        if self._last is not None:
+            self._last = (self._last[0], new_world_from_world @ self._last[1])
+
+    def predict(self, stamp_ns: int) -> FloatArray | None:
+        """world_from_camera (4, 4) at a stamp at the last velocity; the last pose if there is no velocity; None without any pose."""
+        if self._last is None:
+            return None
+        if self._previous is None or self._last[0] <= self._previous[0]:
+            return self._last[1]
+        fraction = (stamp_ns - self._previous[0]) / (self._last[0] - self._previous[0])
+        return poses.interpolate(self._previous[1], self._last[1], fraction)
+
+    def twist(self) -> FloatArray | None:
+        """Angular (rad/s) and linear (map units/s) velocity (6,) in the camera frame between the last two poses."""
+        if self._last is None or self._previous is None or self._last[0] <= self._previous[0]:
+            return None
+        seconds = (self._last[0] - self._previous[0]) / 1e9
+        relative = poses.inverse(self._previous[1]) @ self._last[1]
+        return np.concatenate([poses.so3_log(relative[:3, :3]), relative[:3, 3]]) / seconds
