@@ -32,6 +32,15 @@ class Alignment:
 
 
 @dataclass(frozen=True, slots=True)
+class RunPoses:
+    """Positions to draw, all in one frame: estimate (N, 3), predicted while the shutter was closed (H, 3), groundtruth (G, 3) or None."""
+
+    estimate: FloatArray
+    predicted: FloatArray
+    groundtruth: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True)
 class Association:
     """Per frame (F,) the index of the pose and of the ground truth that belong to it, `UNMATCHED` where there is none."""
 
