@@ -1,8 +1,5 @@
 """Monocular SLAM for thermal cameras, as a library without ROS."""
 
-from importlib.metadata import PackageNotFoundError, version
+from thegra_core.version import VERSION as __version__
 
-try:
-    __version__ = version("thegra_ros")
-except PackageNotFoundError:  # run from a source tree that is not installed
-    __version__ = "unknown"
+__all__ = ["__version__"]

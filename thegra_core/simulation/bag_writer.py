@@ -80,7 +80,7 @@ def camera_yaml(camera: CameraModel) -> str:
         "rectification_matrix": _matrix(np.eye(3)),
         "projection_matrix": _matrix(_projection(camera)),
     }
-    return yaml.safe_dump(values, sort_keys=False, default_flow_style=None)
+    return str(yaml.safe_dump(values, sort_keys=False, default_flow_style=None))
 
 
 def _matrix(values: FloatArray) -> dict[str, Any]:

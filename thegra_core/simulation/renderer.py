@@ -44,44 +44,65 @@ def render(
         noise_counts: Standard deviation of white temporal noise, in counts.
         rng: Source of the noise; needed when `noise_counts` is not 0.
     """
-    height, width = rays.shape[:2]
-    directions = rays.reshape(-1, 3)
-    depth = np.full(len(directions), np.inf)
-    counts = np.full(len(directions), scene.background)
+    depth = np.full(rays.shape[:2], np.inf)
+    counts = np.full(rays.shape[:2], scene.background)
+    bounds = _ray_bounds(rays)
     for face in scene.faces:
-        _draw(face, directions, world_from_camera, depth, counts)
+        window = _window(face, world_from_camera, bounds)
+        _draw(face, rays[window], world_from_camera, depth[window], counts[window])
     if noise_counts > 0:
         if rng is None:
             raise ValueError("noise needs a random generator: pass rng=numpy.random.default_rng(seed)")
-        counts += noise_counts * rng.standard_normal(len(counts))
-    image = np.clip(np.rint(counts), 0, 65535).astype(np.uint16).reshape(height, width)
-    return Rendering(image, depth.reshape(height, width))
+        counts += noise_counts * rng.standard_normal(counts.shape)
+    return Rendering(np.clip(np.rint(counts), 0, 65535).astype(np.uint16), depth)
 
 
-def _draw(face: Face, directions: FloatArray, world_from_camera: FloatArray, depth: FloatArray, counts: FloatArray) -> None:
-    """Draw a face over what is farther; `depth` and `counts` (N,) change in place.
+def _draw(face: Face, rays: FloatArray, world_from_camera: FloatArray, depth: FloatArray, counts: FloatArray) -> None:
+    """Draw a face over what is farther; `depth` and `counts` (H, W) change in place.
 
-    In face axes (u, v, n) a ray is center + z * axes @ direction, so the plane n = 0 is met at z = -center_n / (axes_n . direction).
+    In face axes (u, v, n) a ray is center + z * axes @ ray, so the plane n = 0 is met at z = -center_n / (axes_n . ray).
     """
     axes_from_world = np.stack([face.u, face.v, np.cross(face.u, face.v)])
     center = axes_from_world @ (world_from_camera[:3, 3] - face.origin)
     axes_from_camera = axes_from_world @ world_from_camera[:3, :3]
-    if abs(center[2]) < _NEAR_M or not _may_be_seen(face, world_from_camera):
+    if depth.size == 0 or abs(center[2]) < _NEAR_M:
         return
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        z = -center[2] / (directions @ axes_from_camera[2])
-        candidates = np.flatnonzero((z > _NEAR_M) & (z < depth))
-        rays, z = directions[candidates], z[candidates]
-        u = center[0] + z * (rays @ axes_from_camera[0])
-        v = center[1] + z * (rays @ axes_from_camera[1])
+        z = -center[2] / (rays @ axes_from_camera[2])
+        candidates = np.nonzero((z > _NEAR_M) & (z < depth))
+        z = z[candidates]
+        u, v = (center[:2, None] + z * (rays[candidates] @ axes_from_camera[:2].T).T)
     hit = (u >= 0) & (u <= face.size[0]) & (v >= 0) & (v <= face.size[1])
-    index = candidates[hit]
-    depth[index] = z[hit]
-    counts[index] = face.texture.sample(u[hit], v[hit])
+    pixels = candidates[0][hit], candidates[1][hit]
+    depth[pixels] = z[hit]
+    counts[pixels] = face.texture.sample(u[hit], v[hit])
 
 
-def _may_be_seen(face: Face, world_from_camera: FloatArray) -> bool:
-    """Whether any part of a face lies before the camera."""
+def _ray_bounds(rays: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Least and greatest x of each image column (W,) and y of each row (H,)."""
+    x, y = rays[..., 0], rays[..., 1]
+    low, high = np.inf, -np.inf
+    known = np.isfinite(x)
+    return (
+        np.min(x, axis=0, where=known, initial=low),
+        np.max(x, axis=0, where=known, initial=high),
+        np.min(y, axis=1, where=known, initial=low),
+        np.max(y, axis=1, where=known, initial=high),
+    )
+
+
+def _window(face: Face, world_from_camera: FloatArray, bounds: tuple[FloatArray, FloatArray, FloatArray, FloatArray]) -> tuple[slice, slice]:
+    """Rows and columns outside of which a face is not seen; all of them when it reaches behind the camera."""
     width, height = face.size
-    corners = face.points([[0, 0], [width, 0], [0, height], [width, height]])
-    return bool(np.any((corners - world_from_camera[:3, 3]) @ world_from_camera[:3, 2] > _NEAR_M))
+    corners = (face.points([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]]) - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+    if np.all(corners[:, 2] <= _NEAR_M):
+        return slice(0), slice(0)
+    if np.any(corners[:, 2] <= _NEAR_M):
+        return slice(None), slice(None)
+    projected = corners[:, :2] / corners[:, 2:]
+    (x_low, y_low), (x_high, y_high) = projected.min(axis=0), projected.max(axis=0)
+    columns = np.flatnonzero((bounds[0] <= x_high) & (bounds[1] >= x_low))
+    rows = np.flatnonzero((bounds[2] <= y_high) & (bounds[3] >= y_low))
+    if not len(rows) or not len(columns):
+        return slice(0), slice(0)
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)

@@ -6,7 +6,7 @@ blobs and soft-edged patches, so that every view of a face shows the same functi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,7 +87,7 @@ def plane(seed: int = 0, size: tuple[float, float] = (12.0, 12.0)) -> Scene:
     return Scene((Face(origin, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), size, random_texture(rng, size, COUNTS, 260.0)),))
 
 
-SCENES = {"room": room, "plane": plane}
+SCENES: dict[str, Callable[[int], Scene]] = {"room": room, "plane": plane}
 
 
 def random_texture(rng: np.random.Generator, size: tuple[float, float], level: float, contrast: float) -> Texture:
