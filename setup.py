@@ -9,11 +9,16 @@ PACKAGE = "thegra_ros"
 ROOT = Path(__file__).resolve().parent
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 
+# On Python 3.10 the newest gtsam is 4.2, which was built for numpy 1 and crashes with numpy 2; and kornia 0.9, which works there
+# (thegra_core/features/python310.py), says that it does not, so pip must be told to take it: README.md, Installation.
 REQUIRES = [
-    "numpy>=1.26",
+    "numpy>=1.26,<2; python_version < '3.11'",
+    "numpy>=2.0; python_version >= '3.11'",
+    "gtsam==4.2; python_version < '3.11'",
+    "gtsam>=4.2.1; python_version >= '3.11'",
+    "kornia>=0.9,<0.10; python_version >= '3.11'",
     "opencv-python-headless>=4.8",
     "scikit-image>=0.22",
-    "gtsam>=4.2",
     "rosbags>=0.11",
     "mcap>=1.2",
     "poselib>=2.0.4",
@@ -23,8 +28,7 @@ REQUIRES = [
     "rich>=13",
     "jinja2>=3.1",
     "matplotlib>=3.8",
-    "kornia>=0.9,<0.10",
-    "torch>=2.2",
+    "torch>=2.4",
 ]
 TEST = ["pytest>=8", "pytest-timeout>=2.2", "hypothesis>=6.100", "evo>=1.28", "pytransform3d>=3.5", "scipy>=1.11"]
 EXTRAS = {
