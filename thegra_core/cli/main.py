@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from thegra_core.cli.weights import app as weights_app
 from thegra_core.errors import ThegraError
 from thegra_core.version import VERSION
 
@@ -88,6 +89,52 @@ def run(
         groundtruth=groundtruth, max_frames=max_frames, start_s=start, duration_s=duration, seed=seed, viewer=viewer, quiet=quiet,
     )  # fmt: skip
     raise typer.Exit(run_recording(options))
+
+
+@app.command()
+def score(
+    trajectory: Annotated[Path, typer.Argument(help="TUM file: t tx ty tz qx qy qz qw a line.")],
+    groundtruth: Annotated[Path, typer.Argument(help="TUM file to score against.")],
+    images: Annotated[Path | None, typer.Option(metavar="FILE", help="List with a stamp first on each line: the frames that count. Default: the ground truth's.")] = None,
+    shutter: Annotated[Path | None, typer.Option(metavar="FILE", help="`begin end` of each shutter closure; frames inside are not scored.")] = None,
+    tolerance: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="Farthest stamp that belongs to a frame. Default: half a frame period.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Score a trajectory against ground truth: coverage, ATE and RPE after Sim(3) alignment.
+
+    Example: `thegra score runs/flight/trajectory.txt groundtruth.txt --images images.txt`
+    """
+    from thegra_core.cli.score import score_command
+
+    score_command(trajectory, groundtruth, images, shutter, tolerance, as_json)
+
+
+@app.command()
+def config(
+    profile: Annotated[str | None, typer.Option(help="paper, quality or fast. Default: quality.")] = None,
+    as_yaml: Annotated[bool, typer.Option("--yaml", help="Print YAML that --config reads.")] = False,
+) -> None:
+    """List every parameter with value, range, unit and source.
+
+    Example: `thegra config --profile fast --yaml > mine.yaml`
+    """
+    from thegra_core.cli.config import config_command
+
+    config_command(profile, as_yaml)
+
+
+@app.command()
+def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
+    """Tell what is installed, which networks, weights and backends are usable: one page to paste in a bug report.
+
+    Example: `thegra doctor --json > doctor.json`
+    """
+    from thegra_core.cli.doctor import doctor_command
+
+    doctor_command(as_json)
+
+
+app.add_typer(weights_app, name="weights")
 
 
 if __name__ == "__main__":

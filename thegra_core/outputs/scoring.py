@@ -6,7 +6,7 @@ ATE as Sturm et al. 2012 (RGB-D benchmark), alignment as Umeyama 1991. A monocul
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from thegra_core.outputs.trajectory import Trajectory
 
 MIN_PAIRS = 3
 UNMATCHED = -1
+_ARRAYS = ("alignment", "stamps_ns", "errors", "estimate_index", "groundtruth_index")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,7 @@ class Score:
     """Errors in ground-truth units; None where there are too few pairs to tell.
 
     ate_rel is ate_rmse over the RMS spread of the ground truth: 1 is the worst an aligned trajectory can do. recall_1pct counts frames whose
-    error is under 1 % of the path, of all frames with ground truth. stamps_ns and errors (P,) belong to the scored pairs.
+    error is under 1 % of the path, of all frames with ground truth. stamps_ns, errors and the indices (P,) belong to the scored pairs.
     """
 
     frames: int
@@ -79,10 +80,12 @@ class Score:
     alignment: Alignment | None = None
     stamps_ns: IntArray | None = None
     errors: FloatArray | None = None
+    estimate_index: IntArray | None = None
+    groundtruth_index: IntArray | None = None
 
     def as_dict(self) -> dict[str, float | int | None]:
         """The figures, without arrays."""
-        return {name: getattr(self, name) for name in self.__slots__ if name not in ("alignment", "stamps_ns", "errors")}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
 
 
 def score_trajectory(
@@ -107,35 +110,19 @@ def score_trajectory(
     association = Association(frames[~closed], association.estimate[~closed], association.groundtruth[~closed])
     both = association.both
     scored = len(association.stamps_ns)
-    tracked_pct = 100.0 * float(np.mean(association.estimate >= 0)) if scored else 0.0
+    tracked_pct = round(100.0 * float(np.mean(association.estimate >= 0)), 2) if scored else 0.0
     path = path_length(groundtruth.positions)
-    base = Score(scored, len(estimate), int(both.sum()), round(tracked_pct, 2), in_closure, path)
+    base = Score(frames=scored, poses=len(estimate), pairs=int(both.sum()), tracked_pct=tracked_pct, in_closure=in_closure, path_length=path)
     if base.pairs < MIN_PAIRS:
         return base
-    poses, truth = estimate.poses[association.estimate[both]], groundtruth.poses[association.groundtruth[both]]
-    alignment = align(poses[:, :3, 3], truth[:, :3, 3])
-    errors = np.linalg.norm(alignment.apply(poses[:, :3, 3]) - truth[:, :3, 3], axis=1)
-    rmse = float(np.sqrt(np.mean(errors**2)))
-    spread = float(np.sqrt(np.mean(np.sum((truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)) ** 2, axis=1))))
-    with_truth = max(int(np.sum(association.groundtruth >= 0)), 1)
-    return Score(
-        frames=base.frames,
-        poses=base.poses,
-        pairs=base.pairs,
-        tracked_pct=base.tracked_pct,
-        in_closure=in_closure,
-        path_length=path,
-        ate_rmse=rmse,
-        ate_median=float(np.median(errors)),
-        ate_max=float(errors.max()),
-        ate_pct=100 * rmse / path if path > 0 else None,
-        ate_rel=rmse / spread if spread > 0 else None,
-        recall_1pct=round(100.0 * float(np.sum(errors < 0.01 * path)) / with_truth, 2),
-        rot_deg=float(np.median(_rotation_errors_deg(alignment.rotation @ poses[:, :3, :3], truth[:, :3, :3]))),
-        scale=alignment.scale,
-        alignment=alignment,
+    scored_pairs = _score_pairs(estimate.poses[association.estimate[both]], groundtruth.poses[association.groundtruth[both]], base)
+    with_truth = int(np.sum(association.groundtruth >= 0))
+    return replace(
+        scored_pairs,
+        recall_1pct=round(100.0 * float(np.sum(np.asarray(scored_pairs.errors) < 0.01 * path)) / with_truth, 2),
         stamps_ns=association.stamps_ns[both],
-        errors=errors,
+        estimate_index=association.estimate[both],
+        groundtruth_index=association.groundtruth[both],
     )
 
 
@@ -172,6 +159,26 @@ def half_period(stamps_ns: IntArray) -> int:
 def path_length(positions: FloatArray) -> float:
     """Length of the polyline through positions (N, 3)."""
     return float(np.sum(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
+
+
+def _score_pairs(poses: FloatArray, truth: FloatArray, base: Score) -> Score:
+    """`base` with the errors of pairs of poses (P, 4, 4)."""
+    alignment = align(poses[:, :3, 3], truth[:, :3, 3])
+    errors = np.linalg.norm(alignment.apply(poses[:, :3, 3]) - truth[:, :3, 3], axis=1)
+    rmse = float(np.sqrt(np.mean(errors**2)))
+    spread = float(np.sqrt(np.mean(np.sum((truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)) ** 2, axis=1))))
+    return replace(
+        base,
+        ate_rmse=rmse,
+        ate_median=float(np.median(errors)),
+        ate_max=float(errors.max()),
+        ate_pct=100 * rmse / base.path_length if base.path_length > 0 else None,
+        ate_rel=rmse / spread if spread > 0 else None,
+        rot_deg=float(np.median(_rotation_errors_deg(alignment.rotation @ poses[:, :3, :3], truth[:, :3, :3]))),
+        scale=alignment.scale,
+        alignment=alignment,
+        errors=errors,
+    )
 
 
 def _inside(stamps_ns: IntArray, intervals_ns: Sequence[tuple[int, int]]) -> BoolArray:

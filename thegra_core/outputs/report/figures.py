@@ -82,16 +82,18 @@ def stages_figure(run: Run) -> str:
     """Milliseconds of each stage, stacked, frame by frame."""
     stages = list(dict.fromkeys(stage for f in run.frames for stage in f.result.stage_ms))
     values = np.array([[f.result.stage_ms.get(stage, 0.0) for f in run.frames] for stage in stages])
+    medians = [float(np.median([f.result.stage_ms[stage] for f in run.frames if stage in f.result.stage_ms])) for stage in stages]
+    labels = [f"{stage} {median:.3g} ms" for stage, median in zip(stages, medians, strict=True)]
     index = np.arange(len(run.frames))
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
         colours = [SERIES[i % len(SERIES)] for i in range(len(stages))]
-        axes.stackplot(index, values, labels=stages, colors=colours, alpha=0.85, step="mid", lw=0)
+        axes.stackplot(index, values, labels=labels, colors=colours, alpha=0.85, step="mid", lw=0)
         axes.set(xlabel="frame", ylabel="ms", xlim=_limits(index))
         top = float(np.percentile(values.sum(axis=0), 99)) * 1.15
         axes.set_ylim(0, max(top, 1e-3))
-        figure.legend(loc="outside lower center", ncols=4)
+        figure.legend(loc="outside lower center", ncols=3)
 
     return draw("stage times per frame", _WIDE, paint)
 

@@ -31,8 +31,10 @@ class Picture:
 
 def pictures(snapshots: Sequence[Snapshot], first_stamp_ns: int) -> list[Picture]:
     """A handful of the snapshots, evenly spread."""
-    chosen = np.unique(np.linspace(0, len(snapshots) - 1, _MAX_FRAMES).round().astype(int)) if snapshots else []
-    return [_picture(snapshots[i], first_stamp_ns) for i in chosen]
+    if not snapshots:
+        return []
+    chosen = np.unique(np.linspace(0, len(snapshots) - 1, _MAX_FRAMES).round().astype(int))
+    return [_picture(snapshots[i], first_stamp_ns) for i in chosen.tolist()]
 
 
 def _picture(snapshot: Snapshot, first_stamp_ns: int) -> Picture:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -14,7 +15,7 @@ BLUE, ORANGE, GREEN, PURPLE, PINK, TEAL, RED, GREY = (f"#a0000{i}" for i in rang
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, TEAL, PINK, RED, GREY)
 
 _VARIABLES = {FOREGROUND: "--fg", MUTED: "--muted", GRID: "--grid"} | {c: f"--c{i}" for i, c in enumerate((BLUE, ORANGE, GREEN, PURPLE, PINK, TEAL, RED, GREY), 1)}
-_STYLE = {
+_STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "thegra",
     "font.size": 9,
