@@ -11,7 +11,8 @@ from typing import Any
 
 from thegra_core.errors import CalibrationError, InputError
 from thegra_core.messages import Frame, ImageArray
-from thegra_core.sources.bag_files import BagFile, RawMessage, open_bag_files
+from thegra_core.sources.bag_files import BagFile, open_bag_files
+from thegra_core.sources.bag_walks import RawMessage
 from thegra_core.sources.calibration import camera_beside, camera_from_info
 from thegra_core.sources.image_decoding import DecodeError, decode_compressed, decode_raw
 from thegra_core.sources.recording import ImageTopic, Source
@@ -60,13 +61,14 @@ def open_bag(path: Path, topic: str | None = None) -> BagRecording:
     """
     files = open_bag_files(path)
     topics = _image_topics(files)
-    picked, why = _pick(topics, topic, path)
+    damage = "".join(f"\n  {file.damage}" for file in files if file.damage)
+    picked, why = _pick(topics, topic, path, damage)
     recording = BagRecording(name=path.resolve().stem, path=path, topic=picked.name, frame_count=picked.count, files=files)
     recording.note(why)
     for file in files:
         if file.damage:
             recording.note(file.damage)
-    _add_camera(recording)
+    _add_camera(recording, only_image_topic=len(topics) == 1)
     return recording
 
 
@@ -123,8 +125,10 @@ def _describe(files: list[BagFile], name: str, kind: str, count: int | None) -> 
     return ImageTopic(name, kind, count, encoding, size, kind == COMPRESSED)
 
 
-def _pick(topics: list[ImageTopic], wanted: str | None, path: Path) -> tuple[ImageTopic, str]:
+def _pick(topics: list[ImageTopic], wanted: str | None, path: Path, damage: str) -> tuple[ImageTopic, str]:
     listing = "".join(f"\n  {topic}" for topic in topics)
+    if not topics and damage:
+        raise InputError(f"no image can be read from {path}:{damage}\na ROS 1 bag may be repaired with `rosbag reindex`, an mcap with `mcap recover`, a db3 with `sqlite3 FILE .recover`")
     if not topics:
         raise InputError(f"{path} holds no image topic (sensor_msgs/Image or CompressedImage)\nsee what it holds with: thegra info {path}")
     if wanted is not None:
@@ -156,11 +160,11 @@ def _likely(topics: list[ImageTopic]) -> ImageTopic:
     return _guess(topics)[0]
 
 
-def _add_camera(recording: BagRecording) -> None:
+def _add_camera(recording: BagRecording, only_image_topic: bool) -> None:
     infos = sorted({topic.name for file in recording.files for topic in file.topics if topic.type == CAMERA_INFO and topic.count != 0})
     base = str(recording.topic).removesuffix("/compressed").rpartition("/")[0]
     own = f"{base}/camera_info"
-    name = own if own in infos else infos[0] if len(infos) == 1 and len(_image_topics(recording.files)) == 1 else None
+    name = own if own in infos else infos[0] if len(infos) == 1 and only_image_topic else None
     if name is not None:
         _camera_from_topic(recording, name)
     folder = recording.path if recording.path.is_dir() else recording.path.parent

@@ -5,27 +5,20 @@ rosbags reads ROS 1 bags, rosbag2 folders, mcap and db3. Files that it refuses (
 
 from __future__ import annotations
 
-import sqlite3
+import contextlib
+import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-import zstandard
-from mcap.exceptions import McapError
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.exceptions import EndOfFile
 from rosbags import rosbag1, rosbag2
-from rosbags.rosbag1.reader import Header, RecordType, read_bytes, read_uint32
-from rosbags.typesys import Stores, get_typestore
 
 from thegra_core.errors import InputError
-
-ROS1 = get_typestore(Stores.ROS1_NOETIC)
-ROS2 = get_typestore(Stores.ROS2_HUMBLE)
-_ZSTD = b"\x28\xb5\x2f\xfd"
+from thegra_core.sources.bag_walks import RawMessage, Walk, db3_is_short, walk_db3, walk_mcap, walk_ros1
+from thegra_core.sources.folder import natural_key
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,26 +28,6 @@ class Topic:
     name: str
     type: str
     count: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class RawMessage:
-    """One message as stored; `decode()` gives the object with the message's fields."""
-
-    topic: str
-    type: str
-    data: bytes
-    is_ros1: bool
-
-    def decode(self) -> Any:
-        """The message. Raises whatever the damage in the data makes the deserialiser raise."""
-        if self.is_ros1:
-            return ROS1.deserialize_ros1(self.data, self.type)
-        data = zstandard.ZstdDecompressor().decompressobj().decompress(self.data) if self.data[:4] == _ZSTD else self.data
-        return ROS2.deserialize_cdr(data, self.type)
-
-
-Walk = Callable[[Path], Iterator[RawMessage]]
 
 
 @dataclass
@@ -108,8 +81,6 @@ def open_bag_files(path: Path) -> list[BagFile]:
             damage = f"rosbag2 folder damaged: {_reason(error)}"
     if not files:
         raise InputError(f"{path} holds no bag that can be read ({damage})")
-    from thegra_core.sources.folder import natural_key
-
     bags = [_open_file(file) for file in sorted(files, key=lambda f: natural_key(f.name))]
     if _kind(files[0]) != "bag":
         bags[0].damage = bags[0].damage or damage
@@ -121,17 +92,18 @@ def _open_file(path: Path) -> BagFile:
     if kind is None:
         raise InputError(f"{path} is {'empty' if path.stat().st_size == 0 else 'no bag: it starts like none'}; give a ROS 1 .bag, a rosbag2 folder, .mcap or .db3")
     try:
-        return BagFile(path, _indexed_topics(path))
+        topics = _indexed_topics(path)
+        if kind != "db3" or not db3_is_short(path):
+            return BagFile(path, topics)
+        reason = "the file is shorter than its header says"
     except Exception as error:  # what is damaged decides what rosbags raises
-        damage = f"{path.name} read without its index: {_reason(error)}"
+        reason = _reason(error)
     walk = _WALKS[kind]
     counts: Counter[tuple[str, str]] = Counter()
-    try:
-        for message in walk(path):
-            counts[message.topic, message.type] += 1
-    except Exception as error:  # the counts so far are what there is
-        damage += f"; breaks off: {_reason(error)}"
-    return BagFile(path, [Topic(name, kind, count) for (name, kind), count in counts.items()], damage, walk)
+    # the counts up to where the file breaks off are what there is; `messages` says why
+    with contextlib.suppress(Exception):
+        counts.update((message.topic, message.type) for message in walk(path))
+    return BagFile(path, [Topic(name, kind, count) for (name, kind), count in counts.items()], f"{path.name} read without its index: {reason}", walk)
 
 
 def _indexed_topics(path: Path) -> list[Topic]:
@@ -152,74 +124,9 @@ def _kind(path: Path) -> str | None:
 
 def _reason(error: BaseException) -> str:
     text = str(error.args[0]) if error.args else type(error).__name__
+    if isinstance(error, struct.error | EOFError | EndOfFile) or text.startswith(("Got only", "Header could not be read", "Could not read")):
+        return "the file ends in the middle of a record"
     return (text.strip().splitlines() or [type(error).__name__])[0][:160]
 
 
-def _walk_ros1(path: Path) -> Iterator[RawMessage]:
-    reader = rosbag1.Reader(path)
-    types: dict[int, tuple[str, str]] = {}
-    with path.open("rb") as file:
-        file.readline()
-        yield from _ros1_records(reader, file, types)
-
-
-def _ros1_records(reader: rosbag1.Reader, file: BinaryIO, types: dict[int, tuple[str, str]]) -> Iterator[RawMessage]:
-    while True:
-        start = file.tell()
-        if not file.read(1):
-            return
-        file.seek(start)
-        header = Header.read(file)
-        operation = header.get_uint8("op")
-        if operation == RecordType.CONNECTION:
-            file.seek(start)
-            reader.bio = file
-            connection = reader.read_connection()
-            types[connection.id] = (connection.topic, connection.msgtype)
-        elif operation == RecordType.MSGDATA:
-            topic, kind = types[header.get_uint32("conn")]
-            yield RawMessage(topic, kind, read_bytes(file, read_uint32(file)), True)
-        elif operation == RecordType.CHUNK:
-            file.seek(start)
-            reader.bio = file
-            chunk = reader.read_chunk()
-            file.seek(chunk.datapos)
-            data = file.read(chunk.datasize)
-            uncompressed = header.get_string("compression") == "none"
-            yield from _ros1_records(reader, BytesIO(data if uncompressed else chunk.decompressor(data)), types)
-        else:
-            read_bytes(file, read_uint32(file))
-
-
-def _walk_mcap(path: Path) -> Iterator[RawMessage]:
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    with path.open("rb") as file:
-        for record in StreamReader(file).records:
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message):
-                channel = channels[record.channel_id]
-                kind = schemas[channel.schema_id].name if channel.schema_id in schemas else ""
-                if channel.message_encoding not in ("cdr", "ros1"):
-                    raise McapError(f"messages are encoded as {channel.message_encoding!r}; understood are cdr (ROS 2) and ros1")
-                yield RawMessage(channel.topic, _full_type(kind), record.data, channel.message_encoding == "ros1")
-
-
-def _walk_db3(path: Path) -> Iterator[RawMessage]:
-    database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
-    try:
-        topics = {row[0]: (row[1], row[2]) for row in database.execute("SELECT id, name, type FROM topics")}
-        for topic_id, data in database.execute("SELECT topic_id, data FROM messages NOT INDEXED ORDER BY rowid"):
-            yield RawMessage(*topics[topic_id], data, False)
-    finally:
-        database.close()
-
-
-def _full_type(name: str) -> str:
-    return name if name.count("/") != 1 else name.replace("/", "/msg/")
-
-
-_WALKS: dict[str, Walk] = {"bag": _walk_ros1, "mcap": _walk_mcap, "db3": _walk_db3}
+_WALKS: dict[str, Walk] = {"bag": walk_ros1, "mcap": walk_mcap, "db3": walk_db3}
