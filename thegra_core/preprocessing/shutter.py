@@ -29,8 +29,8 @@ class ShutterDetector:
     seen and stays OPEN. The first other frame is JUST_OPENED, as is a frame after a gap of more than `gap_periods` median periods in an even stream.
     Streams whose stamps are whole seconds or uneven (photo flights) have no gaps.
 
-    Streams padded to a higher rate repeat frames all the time: once three runs of repeats have ended within 90 frames, runs no longer
-    than those are OPEN. A static scene in 8-bit video can repeat exactly for long; it is called CLOSED, which costs nothing: there is nothing new to see.
+    Streams padded to a higher rate repeat frames all the time: once three runs of repeats have ended within 90 frames, runs at most
+    one longer than their median are OPEN. A static scene in 8-bit video can repeat exactly for long; it is called CLOSED, which costs nothing: there is nothing new to see.
     """
 
     def __init__(self, config: ShutterConfig) -> None:
@@ -81,7 +81,7 @@ class ShutterDetector:
     def _usual_run(self) -> int:
         while self._runs and self._runs[0][0] < self._count - _USUAL_WITHIN:
             self._runs.popleft()
-        return int(np.median([length for _, length in self._runs])) if len(self._runs) >= _USUAL_RUNS else 0
+        return int(np.median([length for _, length in self._runs])) + 1 if len(self._runs) >= _USUAL_RUNS else 0
 
     def _is_gap(self, gap_ns: int) -> bool:
         if len(self._periods) < _MIN_PERIODS or self._whole_seconds:

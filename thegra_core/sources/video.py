@@ -30,10 +30,10 @@ class VideoRecording(Source):
         index = 0
         try:
             while True:
-                position_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
                 ok, image = capture.read()
                 if not ok:
                     break
+                position_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
                 stamp_ns = round(position_ms * 1e6) if position_ms > 0 or index == 0 else round(index * 1e9 / self.rate_hz)
                 try:
                     yield Frame(stamp_ns, index, from_array(image))

@@ -1,0 +1,239 @@
+"""Filters and chains against their definitions and against scikit-image and OpenCV."""
+
+from __future__ import annotations
+
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from skimage.restoration import denoise_tv_chambolle
+
+from thegra_core import config as cfg
+from thegra_core.config import PreprocessingConfig
+from thegra_core.errors import ConfigError
+from thegra_core.preprocessing import filters
+from thegra_core.preprocessing.chain import FILTERS, build_chain
+from thegra_core.sources.open import open_recording
+
+DTYPES = (np.uint8, np.uint16, np.float32)
+EVERY_FILTER = tuple(
+    section()
+    for section in (cfg.ChambolleTv, cfg.HistogramClip, cfg.HistogramCdf, cfg.Clahe, cfg.Median, cfg.BandPass, cfg.Bilateral, cfg.PercentileStretch)
+)
+
+
+def thermal(seed=0, height=64, width=80, noise=4.0):
+    """A smooth scene of about 200 counts with edges and noise, as 16-bit counts."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width]
+    scene = 3000 + 60 * np.sin(x / 9) + 40 * np.cos(y / 7) + 80 * ((x // 16 + y // 16) % 2)
+    return np.clip(np.rint(scene + rng.normal(0, noise, scene.shape)), 0, 65535).astype(np.uint16)
+
+
+def he_clip_as_published(image, count, fold):
+    """The loops over the raw histogram, bin by bin."""
+    histogram = np.bincount(image.ravel(), minlength=65536)
+    total, low = 0, 1
+    while total < count:
+        total += histogram[low]
+        low += 1
+    low -= 1
+    total, high = 0, 65535
+    while total < count:
+        total += histogram[high]
+        high -= 1
+    high += 1
+    values = (image.astype(np.float64) - low) * (255 / (high - low))
+    return np.clip(np.rint(np.abs(values) if fold else values), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("fold", [False, True])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_he_clip_is_the_published_one(seed, fold):
+    image = thermal(seed, 512, 640)
+    image[:3, :100] = 0  # missing pixels
+    expected = he_clip_as_published(image, 10000, fold)
+    assert np.abs(filters.he_clip(image, fold=fold).astype(int) - expected).max() <= 1
+
+
+def test_he_clip_of_floats_agrees_with_integers():
+    image = thermal()
+    np.testing.assert_array_equal(filters.he_clip(image.astype(np.float32)), filters.he_clip(image))
+
+
+def test_he_clip_does_not_depend_on_the_scale_of_floats():
+    image = thermal().astype(np.float32)
+    difference = filters.he_clip(image / 16384).astype(int) - filters.he_clip(image)
+    assert np.abs(difference).max() <= 1
+
+
+def test_he_clip_fold_mirrors_the_coldest():
+    image = np.repeat(np.arange(100, 200, dtype=np.uint16), 10).reshape(20, 50)
+    clamped, folded = filters.he_clip(image, 0.1), filters.he_clip(image, 0.1, fold=True)
+    assert clamped[0, 0] == 0 < folded[0, 0]
+    np.testing.assert_array_equal(clamped[image >= 109], folded[image >= 109])
+
+
+def test_chambolle_is_scikit_images():
+    image = thermal(noise=6.0)
+    expected = denoise_tv_chambolle(image.astype(np.float64), weight=4.0)
+    np.testing.assert_allclose(filters.chambolle_tv(image), expected, atol=0.02)
+
+
+@pytest.mark.parametrize("weight", [0.5, 4.0, 20.0])
+def test_chambolle_smooths_more_with_weight_and_keeps_the_mean(weight):
+    image = thermal()
+    smooth = filters.chambolle_tv(image, weight)
+    assert smooth.dtype == np.float32
+    assert smooth.mean() == pytest.approx(image.mean(), abs=0.05)
+    assert np.abs(np.diff(smooth)).sum() < np.abs(np.diff(image.astype(float))).sum()
+
+
+def test_he_cdf_8_bit_is_opencvs_and_16_bit_uses_the_whole_range():
+    image = (thermal() // 16).astype(np.uint8)
+    np.testing.assert_array_equal(filters.he_cdf(image), cv2.equalizeHist(image))
+    assert np.abs(filters.he_cdf(image.astype(np.uint16)).astype(int) - cv2.equalizeHist(image)).max() <= 1
+    wide = filters.he_cdf(thermal())
+    assert (wide.min(), wide.max()) == (0, 255)
+    assert np.abs(np.histogram(wide, 8, (0, 256))[0] / wide.size - 1 / 8).max() < 0.03
+
+
+def test_clahe_is_opencvs():
+    for image in ((thermal() // 16).astype(np.uint8), thermal()):
+        np.testing.assert_array_equal(filters.clahe(image, 2.0, 8), cv2.createCLAHE(2.0, (8, 8)).apply(image))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("size", [3, 5])
+def test_median_inside(dtype, size):
+    image = np.random.default_rng(0).integers(0, 250, (20, 20)).astype(dtype)
+    windows = np.lib.stride_tricks.sliding_window_view(image, (size, size))
+    r = size // 2
+    np.testing.assert_array_equal(filters.median(image, size)[r:-r, r:-r], np.median(windows, axis=(2, 3)).astype(dtype))
+
+
+def test_band_pass_keeps_its_ring():
+    x = np.tile(np.arange(128), (128, 1))
+    slow, fast = (1000 * np.cos(2 * np.pi * k * x / 128) for k in (5, 30))
+    image = (slow + fast + 4000).astype(np.float32)
+    np.testing.assert_allclose(filters.band_pass(image, 0, 10), slow + 4000, atol=1)
+    np.testing.assert_allclose(filters.band_pass(image, 20, 40), np.abs(fast), atol=1)
+    full = np.random.default_rng(0).integers(0, 255, (33, 47)).astype(np.uint8)
+    np.testing.assert_array_equal(filters.band_pass(full, 0, 1000), full)
+
+
+def test_band_pass_is_the_shifted_disc():
+    image = thermal(height=63, width=80).astype(np.float32)
+    spectrum = np.fft.fftshift(np.fft.fft2(image.astype(np.float64)))
+    v, u = np.mgrid[:63, :80]
+    spectrum[np.hypot(v - 31, u - 40) > 12] = 0
+    np.testing.assert_allclose(filters.band_pass(image, 0, 12), np.abs(np.fft.ifft2(np.fft.ifftshift(spectrum))), atol=0.05)
+
+
+def test_bilateral_is_opencvs():
+    image = (thermal() // 16).astype(np.uint8)
+    np.testing.assert_array_equal(filters.bilateral(image), cv2.bilateralFilter(image, 4, 35, 35))
+    assert filters.bilateral(thermal()).dtype == np.float32
+
+
+def test_stretch_maps_its_percentiles():
+    image = np.arange(10000, dtype=np.uint16).reshape(100, 100)
+    out = filters.stretch(image, 1, 99)
+    assert (int(out[0, 99]), int(out[1, 0]), int(out[99, 0])) == (0, 0, 255)
+    assert abs(int(out[50, 0]) - 127) <= 2
+
+
+@given(hnp.arrays(np.uint16, hnp.array_shapes(min_dims=2, max_dims=2, min_side=4, max_side=24)), st.sampled_from([filters.he_clip, filters.he_cdf, filters.stretch]))
+def test_maps_to_8_bit_are_monotone(image, function):
+    for values in (image, image.astype(np.float32), (image >> 8).astype(np.uint8)):
+        out = function(values)
+        order = np.argsort(values, axis=None, kind="stable")
+        assert out.dtype == np.uint8
+        assert np.all(np.diff(out.ravel()[order].astype(int)) >= 0)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.sampled_from(EVERY_FILTER), st.sampled_from(DTYPES), st.integers(0, 2**16), st.integers(8, 40), st.integers(8, 40))
+def test_filters_keep_shape_and_input(section, dtype, seed, height, width):
+    image = np.random.default_rng(seed).integers(0, 256, (height, width)).astype(dtype)
+    before = image.copy()
+    image.setflags(write=False)
+    out = FILTERS[section.filter](image, **section.model_dump(exclude={"filter"}))
+    assert out.shape == image.shape
+    assert out.dtype in DTYPES
+    assert np.all(np.isfinite(out))
+    np.testing.assert_array_equal(image, before)
+
+
+@pytest.mark.parametrize("section", EVERY_FILTER, ids=lambda s: s.filter)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("value", [0, 7, 255])
+def test_constant_images_pass_without_a_word(section, dtype, value):
+    image = np.full((48, 40), value, dtype)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        out = FILTERS[section.filter](image, **section.model_dump(exclude={"filter"}))
+        chained = build_chain(PreprocessingConfig(filters=(section, cfg.HistogramClip())))(image)
+    assert np.all(np.isfinite(out))
+    if section.filter != "clahe":  # it spreads the clipped part of one bin over all
+        assert float(np.ptp(out)) <= 1  # rounding in the bilateral filter
+    assert chained.dtype == np.uint8
+
+
+def test_chain_is_the_papers():
+    image = thermal(height=512, width=640)
+    denoised = denoise_tv_chambolle(image.astype(np.float64), weight=4.0)
+    expected = cv2.medianBlur(he_clip_as_published(np.rint(denoised).astype(np.uint16), 10000, fold=False), 3)
+    out = build_chain(PreprocessingConfig())(image)
+    assert out.dtype == np.uint8
+    difference = np.abs(out.astype(int) - expected)
+    assert np.mean(difference <= 1) > 0.99  # the reference rounds to whole counts before its map, one count is about one grey level here
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_chain_takes_every_type(dtype):
+    out = build_chain(PreprocessingConfig())((thermal() >> 4).astype(dtype))
+    assert out.dtype == np.uint8
+    assert out.std() > 30
+
+
+def test_chain_that_never_gives_8_bit():
+    with pytest.raises(ConfigError, match=r"chambolle_tv -> median gives float32(.|\n)*he_clip, he_cdf, stretch"):
+        build_chain(PreprocessingConfig(filters=(cfg.ChambolleTv(), cfg.Median())))
+
+
+def test_chain_that_gives_8_bit_only_from_8_bit():
+    for sections in ((cfg.Clahe(), cfg.Median()), ()):
+        chain = build_chain(PreprocessingConfig(filters=sections))
+        assert chain((thermal() >> 4).astype(np.uint8)).dtype == np.uint8
+        with pytest.raises(ConfigError, match="gives uint16 from a uint16 image"):
+            chain(thermal())
+
+
+def test_unknown_filter_lists_the_known(tmp_path):
+    file = tmp_path / "config.yaml"
+    file.write_text("preprocessing: {filters: [{filter: magic}]}\n")
+    with pytest.raises(ConfigError) as error:
+        cfg.load_config(file=file)
+    assert "'magic'" in str(error.value)
+    for name in FILTERS:
+        assert name in str(error.value)
+
+
+def test_every_configurable_filter_exists():
+    assert {section.filter for section in EVERY_FILTER} == FILTERS.keys()
+
+
+@pytest.mark.slow
+def test_real_frames(shared_data):
+    for name in ("forest_f6_line1", "orchard_m2ea_drone", "sim_room_shutter", "forest_f0"):
+        image = next(iter(open_recording(shared_data / name).frames())).image
+        denoised = denoise_tv_chambolle(image.astype(np.float32), weight=4.0).astype(np.float32)
+        expected = cv2.medianBlur(filters.he_clip(denoised), 3)
+        out = build_chain(PreprocessingConfig())(image)
+        assert np.mean(np.abs(out.astype(int) - expected) <= 1) >= 0.999, name
+        assert out.std() > 35
