@@ -209,8 +209,9 @@ class BundleConfig(Section):
 class RelocalizationConfig(Section):
     """What happens after tracking is lost."""
 
-    keyframes: int = Field(5, ge=1, description="last keyframes that a lost frame is matched to")
+    keyframes: int = Field(3, ge=1, description="last keyframes that a lost frame is matched to")
     min_inliers: int = Field(30, ge=6, description="inliers of an accepted relocalisation")
+    remembered_frames: int = Field(150, ge=0, description="frames without a pose whose features are kept, to be placed in the map afterwards")
     new_map_after_frames: int = Field(5, ge=1, description="frames lost before a new map is begun beside the old one")
 
 

@@ -10,6 +10,7 @@ from thegra_core.config import ThegraConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.editor import MapEditor
+from thegra_core.map.map import Map
 from thegra_core.mapping import culling
 from thegra_core.mapping.adjustment import adjust_all, adjust_locally
 from thegra_core.mapping.expansion import expand
@@ -66,6 +67,10 @@ class Mapper:
     @property
     def map_ids(self) -> list[int]:
         return sorted(self._editors)
+
+    def map(self, map_id: int) -> Map:
+        """The map itself; the caller reads it and changes nothing."""
+        return self._editors[map_id].map
 
     def summary(self, map_id: int) -> MapSummary:
         """A copy of what a finished map holds, for outputs."""

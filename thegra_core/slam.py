@@ -1,0 +1,203 @@
+"""The whole system: four stages wired in one thread, frame by frame, deterministic."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thegra_core.config import ThegraConfig
+from thegra_core.features.protocols import Extractor, Matcher
+from thegra_core.features.registry import make_extractor, make_matcher
+from thegra_core.geometry.camera import CameraModel
+from thegra_core.map.map import Map
+from thegra_core.mapping.mapper import Mapper
+from thegra_core.messages import Features, Frame, FrameRecord, Run, Shutter, ShutterState, Snapshot, TrackingResult, TrackingState
+from thegra_core.preprocessing.chain import build_chain
+from thegra_core.preprocessing.shutter import ShutterDetector
+from thegra_core.snapshots import SnapshotKeeper
+from thegra_core.tracking.stage import TrackingOutput, TrackingStage
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """Where a frame is: relative to a keyframe, so that the final map carries it."""
+
+    result: TrackingResult
+    index: int
+    map_id: int = -1
+    reference_id: int = -1
+    reference_from_camera: FloatArray | None = None
+    afterwards: bool = False
+
+
+class Slam:
+    """Frames in, poses out; `finish` gives the account of the run.
+
+    Raises:
+        WeightsError: If the configured networks' weights are not there.
+    """
+
+    def __init__(self, camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None) -> None:
+        self._camera = camera
+        self._chain = build_chain(config.preprocessing)
+        self._shutter = ShutterDetector(config.preprocessing.shutter)
+        self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
+        self._matcher = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
+        self._tracking = TrackingStage(camera, config, self._matcher)
+        self._mapper = Mapper(camera, config, self._matcher)
+        self._frames: list[_Placed] = []
+        self._last_stamp_ns: int | None = None
+        self._bad: Counter[str] = Counter()
+        self._closures: list[tuple[int, int]] = []
+        self._snapshots = SnapshotKeeper()
+        self._view: Callable[[], Snapshot] | None = None
+        self._stage_ms: dict[str, float] = {}
+
+    def process(self, frame: Frame) -> TrackingResult:
+        """One frame through all stages; never raises for what an image holds. Bad frames are counted and change nothing."""
+        begin = time.perf_counter()
+        self._stage_ms = {}
+        self._view = None
+        trouble = self._trouble(frame)
+        if trouble:
+            self._bad[trouble] += 1
+            state = TrackingState.INITIALIZING if self._tracking.map_id < 0 else TrackingState.LOST
+            output = TrackingOutput(TrackingResult(frame.stamp_ns, state, reason=trouble))
+        else:
+            self._last_stamp_ns = frame.stamp_ns
+            with self._timed("shutter"):
+                shutter = self._shutter.update(frame)
+            self._note_closure(shutter)
+            output = self._tracking.hold(frame.stamp_ns, shutter.reason) if shutter.shutter is Shutter.CLOSED else self._see(frame)
+        self._stage_ms["total"] = 1e3 * (time.perf_counter() - begin)
+        result = replace(output.result, stage_ms=dict(self._stage_ms))
+        self._record(frame.index, result)
+        return result
+
+    def snapshot(self) -> Snapshot | None:
+        """Image, keypoints and tracks of the last frame; None if it was bad or the shutter was closed."""
+        return self._view() if self._view is not None else None
+
+    def current_map(self) -> tuple[FloatArray, FloatArray]:
+        """Keyframe poses (K, 4, 4) and landmarks (L, 3) of the map being tracked, for viewers; empty before the first map."""
+        if self._tracking.map_id < 0:
+            return np.empty((0, 4, 4)), np.empty((0, 3))
+        summary = self._mapper.summary(self._tracking.map_id)
+        return summary.keyframe_poses, summary.points_world
+
+    def finish(self, progress: Callable[[str], None] | None = None) -> Run:
+        """Full bundle adjustment, late localisation of frames without a pose, and the account of the run."""
+        say = progress or (lambda _: None)
+        say("full bundle adjustment")
+        for map_id in self._mapper.map_ids:
+            update = self._mapper.finish(map_id)
+            if map_id == self._tracking.map_id:
+                self._tracking.apply(update)
+        say("placing frames that had no pose")
+        late = {p.stamp_ns: p for p in self._tracking.localize_afterwards()}
+        for row, placed in enumerate(self._frames):
+            found = late.get(placed.result.stamp_ns)
+            if found is not None and placed.reference_from_camera is None and placed.result.state in (TrackingState.INITIALIZING, TrackingState.LOST):
+                self._frames[row] = replace(
+                    placed, map_id=found.map_id, reference_id=found.reference_id, reference_from_camera=found.reference_from_camera, afterwards=True
+                )
+        maps = {map_id: self._mapper.map(map_id) for map_id in self._mapper.map_ids}
+        by_stamp = {(map_id, k.stamp_ns): k.id for map_id, m in maps.items() for k in m.keyframes.values()}
+        records = tuple(self._final(placed, maps, by_stamp) for placed in self._frames)
+        counts = Counter(r.map_id for r in records if r.world_from_camera is not None)
+        return Run(
+            frames=records,
+            maps=tuple(self._mapper.summary(i) for i in self._mapper.map_ids),
+            main_map_id=max(counts, key=lambda i: (counts[i], -i)) if counts else -1,
+            shutter_closures_ns=tuple(self._closures),
+            losses=self._tracking.losses,
+            relocalizations=self._tracking.relocalizations,
+            bad_frames=dict(self._bad),
+            snapshots=self._snapshots.kept(),
+        )
+
+    # ---- steps ----------------------------------------------------------------------------------------------------------------------
+
+    def _see(self, frame: Frame) -> TrackingOutput:
+        with self._timed("preprocessing"):
+            image = self._chain(frame.image)
+        with self._timed("extraction"):
+            features = self._extractor.extract(image, frame.stamp_ns)
+        reference = self._tracking.reference_features
+        with self._timed("matching"):
+            matches = self._matcher.match(features, reference) if reference is not None else None
+        with self._timed("tracking"):
+            output = self._tracking.process(features, matches)
+        with self._timed("mapping"):
+            if output.initial_map is not None:
+                self._tracking.apply(self._mapper.initialize(output.initial_map))
+            elif output.keyframe is not None:
+                self._tracking.apply(self._mapper.insert(output.keyframe))
+        self._view = lambda: _snapshot(frame, image, features, output, reference)
+        self._snapshots.offer(frame.index, self._view)
+        return output
+
+    def _trouble(self, frame: Frame) -> str:
+        """What is wrong with a frame, or an empty string."""
+        width, height = self._camera.image_size
+        if frame.image.ndim != 2 or frame.image.shape != (height, width):
+            return "image size differs from the camera's"
+        if frame.image.dtype.kind == "f" and not np.all(np.isfinite(frame.image)):
+            return "image holds NaN or infinity"
+        if self._last_stamp_ns is not None and frame.stamp_ns == self._last_stamp_ns:
+            return "stamp repeats"
+        if self._last_stamp_ns is not None and frame.stamp_ns < self._last_stamp_ns:
+            return "stamp goes backwards"
+        return ""
+
+    def _note_closure(self, shutter: ShutterState) -> None:
+        if shutter.shutter is Shutter.CLOSED:
+            if self._closures and self._frames and self._frames[-1].result.state is TrackingState.HOLD:
+                self._closures[-1] = (self._closures[-1][0], shutter.stamp_ns)
+            else:
+                self._closures.append((shutter.stamp_ns, shutter.stamp_ns))
+
+    def _record(self, index: int, result: TrackingResult) -> None:
+        if result.state is not TrackingState.TRACKING or result.world_from_camera is None:
+            self._frames.append(_Placed(result, index))
+            return
+        reference = self._mapper.map(result.map_id).keyframes[result.reference_id]
+        relative = np.eye(4) if result.is_keyframe else reference.camera_from_world @ result.world_from_camera
+        self._frames.append(_Placed(result, index, result.map_id, result.reference_id, relative))
+
+    @staticmethod
+    def _final(placed: _Placed, maps: dict[int, Map], keyframe_by_stamp: dict[tuple[int, int], int]) -> FrameRecord:
+        """A frame carried by the final map; frames that became keyframes of a first map after their time have that keyframe's pose."""
+        if placed.reference_from_camera is not None:
+            pose = maps[placed.map_id].keyframes[placed.reference_id].world_from_camera @ placed.reference_from_camera
+            return FrameRecord(placed.index, placed.result, pose, placed.map_id, placed.afterwards)
+        if placed.result.state in (TrackingState.INITIALIZING, TrackingState.LOST):
+            for map_id, current in maps.items():
+                keyframe_id = keyframe_by_stamp.get((map_id, placed.result.stamp_ns))
+                if keyframe_id is not None:
+                    return FrameRecord(placed.index, placed.result, current.keyframes[keyframe_id].world_from_camera, map_id, True)
+        return FrameRecord(placed.index, placed.result, None, -1)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._stage_ms[stage] = self._stage_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - begin)
+
+
+def _snapshot(frame: Frame, image: NDArray[np.uint8], features: Features, output: TrackingOutput, reference: Features | None) -> Snapshot:
+    tracked = output.landmark_ids >= 0 if output.landmark_ids is not None else np.zeros(len(features), dtype=bool)
+    previous = np.full((len(features), 2), np.nan, dtype=np.float32)
+    if output.matches is not None and reference is not None and output.matches.reference_stamp_ns == reference.stamp_ns:
+        previous[output.matches.indices[:, 0]] = reference.keypoints[output.matches.indices[:, 1]]
+    return Snapshot(frame.stamp_ns, frame.index, output.result.state, image, features.keypoints, tracked, previous)
