@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -202,24 +201,13 @@ def _floats(value: Any, path: Path) -> list[float]:
         raise CalibrationError(f"{path}: {value!r} are no numbers; fill in the capitals of the template") from error
 
 
-class _Loader(yaml.SafeLoader):  # type: ignore[misc]
-    """Also reads OpenCV's matrices."""
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True))
-
-
 def _parse_yaml(text: str, path: Path) -> dict[str, Any]:
-    body = re.sub(r"\A\ufeff?%YAML:?\s*[\d.]+\s*\n", "", text)
+    # OpenCV writes a directive that is no YAML 1.1 and tags its matrices, which are plain mappings
+    body = re.sub(r"\A\ufeff?%YAML:?\s*[\d.]+\s*\n", "", text).replace("!!opencv-matrix", "")
     try:
-        values = yaml.load(body, Loader=_Loader)  # a SafeLoader
+        values = yaml.safe_load(body)
     except yaml.YAMLError as error:
         raise CalibrationError(f"{path} is not YAML ({error}); understood are: {_FORMS}") from error
     if not isinstance(values, dict):
         raise CalibrationError(f"{path} holds no camera; understood are: {_FORMS}")
     return values
-
-
-def with_name(camera: CameraModel, name: str) -> CameraModel:
-    """The same camera under another name."""
-    return replace(camera, name=name)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from thegra_core.errors import InputError
 from thegra_core.geometry.camera import CameraModel
-from thegra_core.sources.bag import bag_image_topics, open_bag
+from thegra_core.sources.bag import bag_image_topics, open_bag, topic_counts
 from thegra_core.sources.bag_files import is_bag
 from thegra_core.sources.calibration import check_image_size, load_camera, missing_camera
 from thegra_core.sources.folder import find_list, open_images, open_list
@@ -50,6 +50,16 @@ def image_topics(path: Path | str) -> list[ImageTopic]:
     """
     path = _existing(path)
     return bag_image_topics(path) if _holds_bag(path) else []
+
+
+def all_topics(path: Path | str) -> list[tuple[str, str, int | None]]:
+    """(name, type, messages or None) of every topic of a bag; none for folders and videos.
+
+    Raises:
+        InputError: If the path does not exist or a bag cannot be read at all.
+    """
+    path = _existing(path)
+    return topic_counts(path) if _holds_bag(path) else []
 
 
 def camera_for(recording: Recording, file: Path | str | None = None, camera: str | None = None) -> CameraModel:
