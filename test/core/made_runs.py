@@ -112,6 +112,9 @@ class FakeSystem:
     def snapshot(self) -> Snapshot | None:
         return self._run.snapshots[0]
 
+    def current_map(self) -> tuple[np.ndarray, np.ndarray]:
+        return self._run.maps[0].keyframe_poses, self._run.maps[0].points_world
+
     def finish(self, progress: Any = None) -> Run:
         frames = self._run.frames[: self.processed]
         return Run(frames, self._run.maps, self._run.main_map_id, self._run.shutter_closures_ns, snapshots=self._run.snapshots)

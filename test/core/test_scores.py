@@ -179,7 +179,7 @@ def test_bad_lists_are_named_by_line(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"a.txt:2: expected"):
             read(tmp_path / "a.txt")
     (tmp_path / "a.txt").write_text("1.0\n")
-    with pytest.raises(InputError, match="a.txt:1: expected `begin end`"):
+    with pytest.raises(InputError, match=r"a.txt:1: expected `begin end`"):
         read_intervals(tmp_path / "a.txt")
     with pytest.raises(InputError, match="cannot read"):
         read_stamps(tmp_path / "absent.txt")
@@ -193,6 +193,7 @@ def test_ground_truth_without_poses_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the scorer leaves its files open
 @pytest.mark.parametrize("sequence", ["kitchen_rgb_7scenes", "sim_room_shutter", "forest_f0"])
 def test_agrees_with_the_independent_scorer(shared_data: Path, tmp_path: Path, sequence: str) -> None:
     scorer = shared_data.parent / "tools" / "score.py"

@@ -108,11 +108,11 @@ def test_errors_name_the_line(tmp_path: Path, line: str, told: str) -> None:
 
 
 def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="absent.txt: No such file"):
+    with pytest.raises(InputError, match=r"absent.txt: No such file"):
         read_tum(tmp_path / "absent.txt")
     binary = tmp_path / "map.ply"
     binary.write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(InputError, match="map.ply is no text file"):
+    with pytest.raises(InputError, match=r"map.ply is no text file"):
         read_tum(binary)
 
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import logging
+import re
 import time
 from typing import Any, Protocol
 
 from rich.console import Console
 from rich.logging import RichHandler
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 from rich.table import Table
 
 from thegra_core.messages import TrackingResult, TrackingState
+from thegra_core.outputs.viewer import Scene
 from thegra_core.outputs.write import WrittenRun
 
 _COLOURS = {
@@ -30,7 +33,7 @@ class Progress(Protocol):
 
     def __enter__(self) -> Progress: ...
     def __exit__(self, *exc: object) -> None: ...
-    def frame(self, result: TrackingResult, unreadable: int) -> None: ...
+    def frame(self, result: TrackingResult, scene: Scene, unreadable: int) -> None: ...
     def stage(self, text: str) -> None: ...
 
 
@@ -43,7 +46,7 @@ class Silent:
     def __exit__(self, *exc: object) -> None:
         """Nothing."""
 
-    def frame(self, result: TrackingResult, unreadable: int) -> None:
+    def frame(self, result: TrackingResult, scene: Scene, unreadable: int) -> None:
         """Nothing."""
 
     def stage(self, text: str) -> None:
@@ -68,7 +71,7 @@ class Bar:
         self._handler = RichHandler(console=console, level=logging.WARNING, show_path=False, show_time=False, markup=False)
         self._began = time.monotonic()
         self._last: tuple[TrackingState | None, str] = (None, "")
-        self._frames = self._keyframes = 0
+        self._frames = self._keyframes = self._landmarks = 0
 
     def __enter__(self) -> Bar:
         logging.getLogger("thegra_core").addHandler(self._handler)
@@ -79,16 +82,17 @@ class Bar:
         self._bar.stop()
         logging.getLogger("thegra_core").removeHandler(self._handler)
 
-    def frame(self, result: TrackingResult, unreadable: int) -> None:
+    def frame(self, result: TrackingResult, scene: Scene, unreadable: int) -> None:
         """Advance by a frame, and say it when the state or the reason for waiting changes."""
         self._frames += 1
-        self._keyframes += result.is_keyframe
-        if (result.state, result.reason) != self._last:
-            self._last = (result.state, result.reason)
-            self._console.print(f"  frame {self._frames}: {_coloured(result.state)}{': ' + result.reason if result.reason else ''}", highlight=False)
+        if result.is_keyframe:
+            self._keyframes, self._landmarks = (len(array) for array in scene.current_map())
+        if (told := (result.state, without_figures(result.reason))) != self._last:
+            self._last = told
+            self._console.print(f"  frame {self._frames}: {_coloured(result.state)}{': ' + escape(result.reason) if result.reason else ''}", highlight=False)
         fps = self._frames / max(time.monotonic() - self._began, 1e-9)
         problems = f" · {unreadable} unreadable" if unreadable else ""
-        facts = f"{fps:.1f} fps · {self._keyframes} keyframes · {result.visible} landmarks in view{problems}"
+        facts = f"{fps:.1f} fps · {self._keyframes} keyframes · {self._landmarks} landmarks{problems}"
         self._bar.update(self._task, advance=1, state=_coloured(result.state), facts=facts)
 
     def stage(self, text: str) -> None:
@@ -101,16 +105,23 @@ def make_progress(quiet: bool, total: int | None) -> Progress:
     return Silent() if quiet else Bar(Console(stderr=True), total)
 
 
-def print_summary(written: WrittenRun, quiet: bool, interrupted: bool) -> None:
-    """The final table, or one line when quiet."""
-    metrics = written.metrics
+def headline(metrics: dict[str, Any]) -> str:
+    """The run in one line."""
     ate = f", ATE {metrics['ate_rmse']:.4g}" if metrics.get("ate_rmse") is not None else ""
-    head = f"{'interrupted: ' if interrupted else ''}{metrics['frames_tracked']} of {metrics['frames_total']} frames tracked ({metrics['tracked_pct']:g} %){ate}"
-    console = Console(stderr=False, highlight=False)
+    return f"{metrics['frames_tracked']} of {metrics['frames_total']} frames tracked ({metrics['tracked_pct']:g} %){ate}"
+
+
+def print_summary(written: WrittenRun, quiet: bool, interrupted: bool, reason: str) -> None:
+    """The final table, or one line when quiet; `reason` is the last that the system gave for having no pose."""
+    metrics = written.metrics
+    head = f"{'interrupted: ' if interrupted else ''}{headline(metrics)}"
+    if not metrics["frames_tracked"] and reason:
+        head += f": {reason}"
+    console = Console(highlight=False)
     if quiet:
         console.print(f"{head}; {written.folder}", soft_wrap=True, markup=False)
         return
-    table = Table(title=head, show_header=False, title_justify="left")
+    table = Table(title=escape(head), show_header=False, title_justify="left")
     for name, value in summary_rows(metrics):
         table.add_row(name, value)
     console.print(table)
@@ -139,6 +150,11 @@ def _error(metrics: dict[str, Any]) -> str:
     if metrics["ate_rmse"] is None:
         return "fewer than 3 frames with pose and ground truth"
     return f"{metrics['ate_rmse']:.4g} over {metrics['ate_pairs']} frames; path {metrics['path_length']:.4g}"
+
+
+def without_figures(text: str) -> str:
+    """The text with its numbers blanked, so that a reason counts as the same while only its figures change."""
+    return re.sub(r"\d+(\.\d+)?", "#", text)
 
 
 def _coloured(state: TrackingState) -> str:

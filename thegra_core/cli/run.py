@@ -6,6 +6,7 @@ import logging
 import shlex
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,11 +15,11 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Protocol
 
-from thegra_core.cli.progress import Progress, make_progress, print_summary
+from thegra_core.cli.progress import Progress, headline, make_progress, print_summary, without_figures
 from thegra_core.config import ThegraConfig, load_config
-from thegra_core.errors import ConfigError, InputError
+from thegra_core.errors import ConfigError, InputError, ThegraError
 from thegra_core.geometry.camera import CameraModel
-from thegra_core.messages import Frame, Run, Snapshot, TrackingResult
+from thegra_core.messages import FloatArray, Frame, Run, Snapshot, TrackingResult
 from thegra_core.outputs.metrics import Timing
 from thegra_core.outputs.trajectory import NS_PER_S
 from thegra_core.outputs.viewer import Viewer, make_viewer
@@ -55,16 +56,32 @@ class System(Protocol):
 
     def process(self, frame: Frame) -> TrackingResult: ...
     def snapshot(self) -> Snapshot | None: ...
-    def finish(self, progress: Any = None) -> Run: ...
+    def current_map(self) -> tuple[FloatArray, FloatArray]: ...
+    def finish(self, progress: Callable[[str], None] | None = None) -> Run: ...
 
 
 @dataclass
-class _Progressed:
-    """How far the loop came, also when it is interrupted."""
+class _Done:
+    """How far the loop came, also when it ends early."""
 
     frames: int = 0
     interrupted: bool = False
+    error: ThegraError | None = None
+    reason: str = ""
     unreadable: dict[str, int] = field(default_factory=dict)
+
+
+class _Changes:
+    """Logs each change of state, and of the reason for it."""
+
+    def __init__(self) -> None:
+        self._last = ""
+
+    def note(self, index: int, result: TrackingResult) -> None:
+        text = f"{result.state.value}: {result.reason}" if result.reason else result.state.value
+        if without_figures(text) != self._last:
+            self._last = without_figures(text)
+            _log.info("frame %d %s (%d matches, %d inliers)", index, text, result.matches, result.inliers)
 
 
 def run_recording(options: RunOptions) -> int:
@@ -74,7 +91,7 @@ def run_recording(options: RunOptions) -> int:
         The exit code: done, nothing tracked, or interrupted.
 
     Raises:
-        ThegraError: If the input or an option cannot be used.
+        ThegraError: If the input or an option cannot be used; what was processed until then is written.
     """
     started = datetime.now(timezone.utc)
     config = load_config(options.profile, options.config, _overrides(options))
@@ -83,12 +100,18 @@ def run_recording(options: RunOptions) -> int:
     groundtruth = _groundtruth(options, recording)
     viewer = make_viewer(options.viewer)
     out = options.out or Path("runs") / f"{recording.name}_{started:%Y%m%dT%H%M%SZ}"
-    with _log_file(out), make_progress(options.quiet, _expected_frames(options, recording)) as progress:
-        _log.info("%s: %s", recording.path, shlex.join(sys.argv))
-        for note in recording.notes:
-            _log.info("%s", note)
+    with _log_file(out), make_progress(options.quiet, _expected_frames(options, recording)) as progress, _interrupts() as interrupted:
+        for line in (f"input {recording.path}", f"arguments {shlex.join(sys.argv[1:])}", *recording.notes):
+            _log.info("%s", line)
         system = make_system(camera, config)
-        done, run, timing = _process(system, _window(recording, options), recording, progress, viewer)
+        done, wall_s = _process(system, _window(recording, options), recording, progress, viewer, interrupted)
+        if done.frames == 0 and done.interrupted:
+            raise KeyboardInterrupt
+        if done.frames == 0:
+            raise done.error or InputError(_no_frames(options, done))
+        begin = time.perf_counter()
+        run = system.finish(progress.stage)
+        timing = Timing(wall_s=wall_s, frames_read=done.frames, finish_s=time.perf_counter() - begin)
         viewer.finish(run)
         facts = RecordingFacts(
             name=recording.name, path=recording.path, topic=recording.topic, camera=camera, weights=_weights(config), problems=done.unreadable,
@@ -96,7 +119,11 @@ def run_recording(options: RunOptions) -> int:
         )  # fmt: skip
         progress.stage("writing the results")
         written = write_run(run, out, config, facts, groundtruth, timing)
-    print_summary(written, options.quiet, done.interrupted)
+        _log.info("%s", headline(written.metrics))
+        done.interrupted = done.interrupted or interrupted()
+    print_summary(written, options.quiet, done.interrupted, done.reason)
+    if done.error is not None:
+        raise done.error
     if done.interrupted:
         return EXIT_INTERRUPTED
     return EXIT_DONE if written.metrics["frames_tracked"] else EXIT_NOTHING
@@ -106,39 +133,40 @@ def make_system(camera: CameraModel, config: ThegraConfig) -> System:
     """The SLAM system; imported here because the networks take seconds to load."""
     from thegra_core.slam import Slam
 
-    system: System = Slam(camera, config)
-    return system
+    return Slam(camera, config)
 
 
-def _process(system: System, frames: Iterator[Frame], recording: Recording, progress: Progress, viewer: Viewer) -> tuple[_Progressed, Run, Timing]:
-    done = _Progressed()
-    before = dict(recording.problems)
+def _process(
+    system: System, frames: Iterator[Frame], recording: Recording, progress: Progress, viewer: Viewer, interrupted: Callable[[], bool]
+) -> tuple[_Done, float]:
+    """All frames through the system; returns also the seconds it took."""
+    done, changes, before = _Done(), _Changes(), dict(recording.problems)
     begin = time.perf_counter()
-    with _interrupt_after_frame() as interrupted:
-        try:
-            for frame in frames:
-                result = system.process(frame)
-                done.frames += 1
-                progress.frame(result, sum(recording.problems.values()))
-                viewer.show(result, system.snapshot)
-                if interrupted():
-                    done.interrupted = True
-                    break
-        except KeyboardInterrupt:
-            done.interrupted = True
-    wall = time.perf_counter() - begin
+    try:
+        for frame in frames:
+            result = system.process(frame)
+            done.frames += 1
+            done.reason = result.reason or done.reason
+            changes.note(frame.index, result)
+            progress.frame(result, system, sum(recording.problems.values()))
+            viewer.show(result, system)
+            if interrupted():
+                break
+    except KeyboardInterrupt:
+        done.interrupted = True
+    except ThegraError as error:
+        done.error = error
+    wall_s = time.perf_counter() - begin
+    done.interrupted = done.interrupted or interrupted()
     done.unreadable = {reason: count - before.get(reason, 0) for reason, count in recording.problems.items() if count > before.get(reason, 0)}
     if done.interrupted:
-        _log.warning("interrupted after %d frames; finishing what is there", done.frames)
-    progress.stage("finishing the map")
-    begin = time.perf_counter()
-    run = system.finish()
-    return done, run, Timing(wall_s=wall, frames_read=done.frames, finish_s=time.perf_counter() - begin)
+        _log.warning("interrupted after %d frames; finishing what is there (again Ctrl-C to stop at once)", done.frames)
+    return done, wall_s
 
 
 @contextmanager
-def _interrupt_after_frame() -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C lets the current frame end, so that the map stays whole; the second is a KeyboardInterrupt at once."""
+def _interrupts() -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C is only noted, so that the map stays whole and the results are written; the second is a KeyboardInterrupt at once."""
     seen = False
 
     def note(_signal: int, _frame: Any) -> None:
@@ -146,11 +174,10 @@ def _interrupt_after_frame() -> Iterator[Callable[[], bool]]:
         seen = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    try:
-        previous = signal.signal(signal.SIGINT, note)
-    except ValueError:  # not the main thread
+    if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
+    previous = signal.signal(signal.SIGINT, note)
     try:
         yield lambda: seen
     finally:
@@ -178,6 +205,11 @@ def _expected_frames(options: RunOptions, recording: Recording) -> int | None:
     known = recording.frame_count if options.start_s == 0 and options.duration_s is None else None
     limits = [n for n in (known, options.max_frames) if n is not None]
     return min(limits) if limits else None
+
+
+def _no_frames(options: RunOptions, done: _Done) -> str:
+    unreadable = "".join(f"\n  {count} x {reason}" for reason, count in done.unreadable.items())
+    return f"no frame of {options.recording} lies in the part that --start and --duration choose{unreadable}\nits length is told by: thegra info {options.recording}"
 
 
 def _overrides(options: RunOptions) -> dict[str, Any]:

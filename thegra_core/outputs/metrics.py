@@ -17,6 +17,8 @@ from thegra_core.outputs.scoring import Score, half_period, score_trajectory
 from thegra_core.outputs.trajectory import NS_PER_S, Trajectory, final_trajectory, live_trajectory
 from thegra_core.version import VERSION
 
+TOTAL = "total"
+"""Stage that covers all others of a frame."""
 _LOST = (TrackingState.LOST, TrackingState.RELOCALIZING)
 _WAITING = (TrackingState.INITIALIZING, TrackingState.WAITING)
 
@@ -36,10 +38,11 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class RunScores:
-    """Scores of the main map: from the finished map, and as estimated at the time."""
+    """Scores of the main map, from the finished map and as estimated at the time, against `truth`: the ground truth over the frames' time."""
 
     final: Score
     live: Score
+    truth: Trajectory
 
 
 def score_run(run: Run, groundtruth: Trajectory) -> RunScores:
@@ -48,7 +51,7 @@ def score_run(run: Run, groundtruth: Trajectory) -> RunScores:
     truth = _within(groundtruth, stamps)
     final = score_trajectory(final_trajectory(run, run.main_map_id), truth, stamps)
     live = score_trajectory(live_trajectory(run, run.main_map_id), truth, stamps)
-    return RunScores(final, live)
+    return RunScores(final, live, truth)
 
 
 def run_metrics(
@@ -67,9 +70,9 @@ def run_metrics(
         "frames_tracked": in_main,
         "frames_tracked_other_maps": len(tracked) - in_main,
         "frames_localized_afterwards": sum(f.localized_afterwards for f in tracked),
-        "frames_held": _count(run.frames, (TrackingState.HOLD,)),
-        "frames_lost": _count(run.frames, _LOST),
-        "frames_initializing": _count(run.frames, _WAITING),
+        "frames_held": _count(run, (TrackingState.HOLD,)),
+        "frames_lost": _count(run, _LOST),
+        "frames_initializing": _count(run, _WAITING),
         "frames_bad": sum(bad.values()),
         "bad_frames": bad,
         "tracked_pct": _percent(in_main, total),
@@ -119,7 +122,7 @@ def _time_metrics(run: Run, timing: Timing) -> dict[str, Any]:
     for frame in run.frames:
         for stage, ms in frame.result.stage_ms.items():
             stages.setdefault(stage, []).append(ms)
-    frame_ms = [sum(f.result.stage_ms.values()) for f in run.frames if f.result.stage_ms]
+    frame_ms = [f.result.stage_ms.get(TOTAL, sum(f.result.stage_ms.values())) for f in run.frames if f.result.stage_ms]
     return {
         "fps": round(timing.frames_read / timing.wall_s, 3) if timing.wall_s > 0 else None,
         "ms_per_frame": percentiles(frame_ms, (50, 95, 99)),
@@ -131,8 +134,13 @@ def _time_metrics(run: Run, timing: Timing) -> dict[str, Any]:
     }
 
 
-def _count(frames: Iterable[FrameRecord], states: tuple[TrackingState, ...]) -> int:
-    return sum(f.world_from_camera is None and f.result.state in states for f in frames)
+def is_bad(frame: FrameRecord, run: Run) -> bool:
+    """Whether a frame could not be used at all: its reason is among those that the run counted as bad."""
+    return frame.world_from_camera is None and frame.result.reason in run.bad_frames
+
+
+def _count(run: Run, states: tuple[TrackingState, ...]) -> int:
+    return sum(f.world_from_camera is None and f.result.state in states and not is_bad(f, run) for f in run.frames)
 
 
 def _percent(part: int, whole: int) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,11 +14,23 @@ from thegra_core.messages import FloatArray, Run, Snapshot, TrackingResult, Trac
 VIEWERS = ("none", "rerun")
 
 
+class Scene(Protocol):
+    """What a viewer may ask the running system; both cost time, so only viewers that draw them ask."""
+
+    def snapshot(self) -> Snapshot | None:
+        """Image and keypoints of the last frame; None if there was nothing to see."""
+        ...
+
+    def current_map(self) -> tuple[FloatArray, FloatArray]:
+        """Keyframe poses (K, 4, 4) and landmarks (L, 3) of the map being tracked."""
+        ...
+
+
 class Viewer(Protocol):
     """Shows a run while it goes on."""
 
-    def show(self, result: TrackingResult, snapshot: Callable[[], Snapshot | None]) -> None:
-        """One processed frame; `snapshot` is called only by viewers that draw it."""
+    def show(self, result: TrackingResult, scene: Scene) -> None:
+        """One processed frame."""
         ...
 
     def finish(self, run: Run) -> None:
@@ -30,7 +41,7 @@ class Viewer(Protocol):
 class NullViewer:
     """Shows nothing."""
 
-    def show(self, result: TrackingResult, snapshot: Callable[[], Snapshot | None]) -> None:
+    def show(self, result: TrackingResult, scene: Scene) -> None:
         """Nothing."""
 
     def finish(self, run: Run) -> None:
@@ -54,29 +65,33 @@ class RerunViewer:
             self._recording.spawn()
         self._recording.log("world", self._rr.ViewCoordinates.RDF, static=True)
 
-    def show(self, result: TrackingResult, snapshot: Callable[[], Snapshot | None]) -> None:
+    def show(self, result: TrackingResult, scene: Scene) -> None:
         """Log the frame at its own time."""
         rr, recording = self._rr, self._recording
-        recording.set_time("stamp", timestamp=result.stamp_ns * 1e-9)
-        picture = snapshot()
+        recording.set_time("stamp", timestamp=np.datetime64(result.stamp_ns, "ns"))
+        picture = scene.snapshot()
         if picture is not None:
             recording.log("image", rr.Image(picture.image, color_model="L"))
             colours = np.where(picture.tracked[:, None], [[64, 200, 120]], [[230, 160, 60]]).astype(np.uint8)
             recording.log("image/keypoints", rr.Points2D(picture.keypoints, colors=colours, radii=2.0))
         if result.world_from_camera is not None:
             self._show_pose(result.world_from_camera, result.state)
+        if result.is_keyframe:
+            self._show_map(*scene.current_map())
         recording.log("state", rr.TextLog(f"{result.state.value} {result.reason}".strip()))
         for name in ("keypoints", "matches", "inliers"):
             recording.log(f"counts/{name}", rr.Scalars(float(getattr(result, name))))
 
     def finish(self, run: Run) -> None:
         """Log the finished map's points and keyframes, and flush."""
-        rr, recording = self._rr, self._recording
         main = next((m for m in run.maps if m.map_id == run.main_map_id), None)
         if main is not None:
-            recording.log("world/points", rr.Points3D(main.points_world))
-            recording.log("world/keyframes", rr.LineStrips3D([main.keyframe_poses[:, :3, 3]]))
-        recording.flush()
+            self._show_map(main.keyframe_poses, main.points_world)
+        self._recording.flush()
+
+    def _show_map(self, keyframe_poses: FloatArray, points_world: FloatArray) -> None:
+        self._recording.log("world/points", self._rr.Points3D(points_world))
+        self._recording.log("world/keyframes", self._rr.LineStrips3D([keyframe_poses[:, :3, 3]]))
 
     def _show_pose(self, world_from_camera: FloatArray, state: TrackingState) -> None:
         rr, recording = self._rr, self._recording

@@ -10,13 +10,13 @@ import jinja2
 from markupsafe import Markup
 
 from thegra_core.config import ThegraConfig, dump_config
-from thegra_core.messages import FrameRecord, Run
+from thegra_core.messages import Run
 from thegra_core.outputs.metrics import RunScores
 from thegra_core.outputs.report.figures import counts_figure, error_figure, stages_figure, trajectory_figure
 from thegra_core.outputs.report.frames import pictures
-from thegra_core.outputs.report.timeline import Fate, Stretch, events, fate_of, stretches, times_s
+from thegra_core.outputs.report.timeline import Fate, Stretch, events, fate_of, stretches
 from thegra_core.outputs.scoring import RunPoses
-from thegra_core.outputs.trajectory import Trajectory, final_trajectory, predicted_trajectory
+from thegra_core.outputs.trajectory import NS_PER_S, Trajectory, final_trajectory, predicted_trajectory
 
 _MAX_LISTED = 12
 
@@ -76,7 +76,7 @@ def build_report(report: ReportInput) -> str:
         metrics=report.metrics,
         tiles=_tiles(report),
         bars=_bars(parts),
-        keyframe_path=_keyframe_path(run.frames, parts),
+        keyframe_path=_keyframe_path(run, parts),
         duration_s=parts[-1].end_s if parts else 0.0,
         legend=_legend(run),
         figures=_figures(report),
@@ -94,9 +94,9 @@ def run_poses(report: ReportInput) -> RunPoses | None:
         return None
     predicted = predicted_trajectory(report.run).positions
     alignment = report.scores.final.alignment if report.scores else None
-    if alignment is None or report.groundtruth is None:
+    if alignment is None or report.scores is None:
         return RunPoses(estimate, predicted, None)
-    return RunPoses(alignment.apply(estimate), alignment.apply(predicted), report.groundtruth.positions)
+    return RunPoses(alignment.apply(estimate), alignment.apply(predicted), report.scores.truth.positions)
 
 
 def _figures(report: ReportInput) -> dict[str, Markup]:
@@ -149,17 +149,17 @@ def _bars(parts: list[Stretch]) -> list[Bar]:
     ]
 
 
-def _keyframe_path(frames: tuple[FrameRecord, ...], parts: list[Stretch]) -> str:
+def _keyframe_path(run: Run, parts: list[Stretch]) -> str:
     if not parts:
         return ""
-    times = times_s(frames)
-    keys = [time for time, f in zip(times, frames, strict=True) if f.result.is_keyframe]
-    return "".join(f"M{1000 * time / parts[-1].end_s:.2f} 0V10" for time in keys)
+    first = min(f.stamp_ns for f in run.frames)
+    seconds = [(stamp - first) / NS_PER_S for m in run.maps for stamp in m.keyframe_stamps_ns.tolist()]
+    return "".join(f"M{1000 * time / parts[-1].end_s:.2f} 0V10" for time in seconds)
 
 
 def _legend(run: Run) -> list[tuple[str, str, int]]:
     """CSS class, name and number of frames of each fate that occurs."""
-    fates = [fate_of(f, run.main_map_id) for f in run.frames]
+    fates = [fate_of(f, run) for f in run.frames]
     return [(fate.name.lower(), fate.value, fates.count(fate)) for fate in Fate if fate in fates]
 
 
@@ -176,6 +176,6 @@ def _warnings(report: ReportInput) -> list[str]:
         told.append("The error is of the size of the path itself: the trajectory is wrong, not just inexact.")
     if m["maps"] > 1:
         told.append(f"{m['maps']} maps could not be joined; figures are those of the one with most frames.")
-    told += [f"{count} bad frames: {reason}" for reason, count in m["bad_frames"].items()]
+    told += [f"Bad frames: {count} × {reason}." for reason, count in m["bad_frames"].items()]
     return told[:_MAX_LISTED]
 

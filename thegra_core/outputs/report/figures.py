@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from thegra_core.messages import FloatArray, FrameRecord, Run
+from thegra_core.outputs.metrics import TOTAL
 from thegra_core.outputs.report.svg import BLUE, FOREGROUND, GREEN, GREY, ORANGE, SERIES, TEAL, draw
 from thegra_core.outputs.report.timeline import times_s
 from thegra_core.outputs.scoring import RunPoses, Score
@@ -80,10 +81,9 @@ def counts_figure(run: Run) -> str:
 
 def stages_figure(run: Run) -> str:
     """Milliseconds of each stage, stacked, frame by frame."""
-    stages = list(dict.fromkeys(stage for f in run.frames for stage in f.result.stage_ms))
+    stages = list(dict.fromkeys(stage for f in run.frames for stage in f.result.stage_ms if stage != TOTAL))
     values = np.array([[f.result.stage_ms.get(stage, 0.0) for f in run.frames] for stage in stages])
-    medians = [float(np.median([f.result.stage_ms[stage] for f in run.frames if stage in f.result.stage_ms])) for stage in stages]
-    labels = [f"{stage} {median:.3g} ms" for stage, median in zip(stages, medians, strict=True)]
+    labels = [f"{stage} {mean:.{0 if mean >= 10 else 1}f}" for stage, mean in zip(stages, values.mean(axis=1), strict=True)]
     index = np.arange(len(run.frames))
 
     def paint(figure: Figure) -> None:
@@ -93,7 +93,7 @@ def stages_figure(run: Run) -> str:
         axes.set(xlabel="frame", ylabel="ms", xlim=_limits(index))
         top = float(np.percentile(values.sum(axis=0), 99)) * 1.15
         axes.set_ylim(0, max(top, 1e-3))
-        figure.legend(loc="outside lower center", ncols=3)
+        figure.legend(loc="outside lower center", ncols=3, title="mean ms a frame", title_fontsize=9)
 
     return draw("stage times per frame", _WIDE, paint)
 

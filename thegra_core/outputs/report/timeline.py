@@ -10,6 +10,7 @@ from itertools import groupby
 import numpy as np
 
 from thegra_core.messages import FrameRecord, Run, TrackingState
+from thegra_core.outputs.metrics import is_bad
 from thegra_core.outputs.trajectory import NS_PER_S
 
 _GAP_PERIODS = 3.0  # a longer gap between stamps is shown as a gap, not as a long frame
@@ -26,6 +27,7 @@ class Fate(Enum):
     HELD = "held (predicted)"
     LOST = "lost"
     INITIALIZING = "initializing"
+    BAD = "bad frame"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +49,12 @@ class Event:
     text: str
 
 
-def fate_of(frame: FrameRecord, main_map_id: int) -> Fate:
-    """What became of one frame."""
+def fate_of(frame: FrameRecord, run: Run) -> Fate:
+    """What became of one frame of a run."""
+    if is_bad(frame, run):
+        return Fate.BAD
     if frame.world_from_camera is not None:
-        if frame.map_id != main_map_id:
+        if frame.map_id != run.main_map_id:
             return Fate.OTHER_MAP
         return Fate.AFTERWARDS if frame.localized_afterwards else Fate.TRACKED
     if frame.result.state is TrackingState.HOLD:
@@ -75,7 +79,7 @@ def stretches(run: Run) -> list[Stretch]:
     lengths = np.append(np.where(steps > _GAP_PERIODS * period, period, steps), period)
     found: list[Stretch] = []
     for i, frame in enumerate(frames):
-        fate = fate_of(frame, run.main_map_id)
+        fate = fate_of(frame, run)
         begin, end = float(times[i]), float(times[i] + lengths[i])
         if found and found[-1].fate is fate and begin - found[-1].end_s < 1e-6:
             found[-1] = Stretch(fate, found[-1].begin_s, end, found[-1].frames + 1)
