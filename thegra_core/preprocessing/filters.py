@@ -10,15 +10,15 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from skimage.restoration import denoise_tv_chambolle
 
 from thegra_core.messages import ImageArray
+from thegra_core.preprocessing import chambolle
 
 _LEVELS_16 = 65536
 
 
 def chambolle_tv(image: ImageArray, weight: float = 4.0, eps: float = 2e-4, max_iterations: int = 200) -> NDArray[np.float32]:
-    """Total-variation denoising (Chambolle 2004), to float32.
+    """Total-variation denoising (Chambolle 2004), to float32; equals scikit-image's on the same values as floats.
 
     Args:
         image: Any of the three types; values are taken as they are.
@@ -29,7 +29,7 @@ def chambolle_tv(image: ImageArray, weight: float = 4.0, eps: float = 2e-4, max_
     values = image.astype(np.float32)
     if values.min() == values.max():
         return values
-    return np.asarray(denoise_tv_chambolle(values, weight=weight, eps=eps, max_num_iter=max_iterations), dtype=np.float32)
+    return chambolle.denoise(values, weight, eps, max_iterations)
 
 
 def he_clip(image: ImageArray, tail_fraction: float = 10000 / (640 * 512), fold: bool = False) -> NDArray[np.uint8]:
