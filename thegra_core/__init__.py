@@ -1,5 +1,5 @@
 """Monocular SLAM for thermal cameras, as a library without ROS."""
 
-from thegra_core.version import VERSION as __version__
+from thegra_core.version import VERSION
 
-__all__ = ["__version__"]
+__version__ = VERSION
