@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -250,6 +251,48 @@ def test_duplicate_and_backward_stamps_are_handed_on(tmp_path):
     stamps = [T0, T0 + 10, T0 + 10, T0 + 5]
     items = [("/t/image", IMAGE, image_message(ROS1, picture(i), stamp), T0 + i) for i, stamp in enumerate(stamps)]
     assert [f.stamp_ns for f in open_recording(write_ros1(tmp_path / "a.bag", items)).frames()] == stamps
+
+
+def test_stamps_that_were_never_filled_in_are_said(tmp_path):
+    items = [("/t/image", IMAGE, image_message(ROS1, picture(i), 0), T0 + i) for i in range(2)]
+    recording = open_recording(write_ros1(tmp_path / "a.bag", items))
+    assert [f.stamp_ns for f in recording.frames()] == [0, 0]
+    assert any("header stamps are 0" in note for note in recording.notes)
+
+
+def test_log_left_by_a_crashed_recorder_is_said(tmp_path):
+    folder = write_ros2(tmp_path / "run", stream(ROS2))
+    file = next(folder.glob("*.db3"))
+    file.with_name(file.name + "-wal").write_bytes(b"x")
+    recording = open_recording(file)
+    assert len(list(recording.frames())) == 6
+    assert any("wal_checkpoint" in problem for problem in recording.problems)
+
+
+def test_compressed_bag_without_metadata(tmp_path):
+    folder = write_ros2(tmp_path / "run", stream(ROS2), "MCAP", "FILE")
+    (folder / "metadata.yaml").unlink()
+    with pytest.raises(InputError, match="zstd -d"):
+        open_recording(folder)
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])
+def test_random_damage_never_crashes(tmp_path, kind):
+    rng = np.random.default_rng(7)
+    if kind == "bag":
+        whole = write_ros1(tmp_path / "whole.bag", stream(ROS1) + infos(ROS1), "LZ4").read_bytes()
+    else:
+        folder = write_ros2(tmp_path / "run", stream(ROS2) + infos(ROS2), {"mcap": "MCAP", "db3": "SQLITE3"}[kind])
+        whole = next(folder.glob("*." + kind)).read_bytes()
+    opened = 0
+    for i in range(25):
+        data = np.frombuffer(whole, np.uint8).copy()
+        data[rng.integers(0, len(data) if i % 2 else 1500, 6)] = rng.integers(0, 256, 6)
+        path = tmp_path / f"damaged.{kind}"
+        path.write_bytes(data.tobytes())
+        with contextlib.suppress(InputError):
+            opened += len(list(open_recording(path).frames())) > 0
+    assert opened > 0
 
 
 def test_not_a_recording(tmp_path):

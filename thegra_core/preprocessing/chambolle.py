@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Float32Array = NDArray[np.float32]
 
 _TAU = 0.25
-_STRIP_PIXELS = 20480
+_STRIP_PIXELS = 32768
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,6 +39,8 @@ class BagRecording(Source):
                 index += 1
                 frame = self._frame(message, index)
                 if frame is not None:
+                    if frame.stamp_ns == 0:
+                        self.note("header stamps are 0: the driver did not fill them in, and without them motion in time is unknown")
                     yield frame
             self.problems.update(file.problems)
 

@@ -32,7 +32,7 @@ class Topic:
 
 @dataclass
 class BagFile:
-    """One bag file, or one rosbag2 folder with sound metadata; `damage` says why it cannot be read through its index."""
+    """One bag file, or one rosbag2 folder with sound metadata; `damage` says what is wrong with it."""
 
     path: Path
     topics: list[Topic]
@@ -94,7 +94,7 @@ def _open_file(path: Path) -> BagFile:
     try:
         topics = _indexed_topics(path)
         if kind != "db3" or not db3_is_short(path):
-            return BagFile(path, topics)
+            return BagFile(path, topics, _unmerged_log(path))
         reason = "the file is shorter than its header says"
     except Exception as error:  # what is damaged decides what rosbags raises
         reason = _reason(error)
@@ -104,6 +104,14 @@ def _open_file(path: Path) -> BagFile:
     with contextlib.suppress(Exception):
         counts.update((message.topic, message.type) for message in walk(path))
     return BagFile(path, [Topic(name, kind, count) for (name, kind), count in counts.items()], f"{path.name} read without its index: {reason}", walk)
+
+
+def _unmerged_log(path: Path) -> str:
+    """SQLite's log beside the file, left by a recorder that crashed: what it holds is not read."""
+    log = path.with_name(path.name + "-wal")
+    if not log.is_file() or log.stat().st_size == 0:
+        return ""
+    return f"{log.name} holds messages that {path.name} does not; merge them with: sqlite3 {path} 'PRAGMA wal_checkpoint(TRUNCATE)'"
 
 
 def _indexed_topics(path: Path) -> list[Topic]:

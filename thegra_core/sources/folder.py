@@ -71,6 +71,8 @@ def open_images(folder: Path, rate_hz: float = ASSUMED_RATE_HZ) -> FolderRecordi
         InputError: If it holds no images.
     """
     files = sorted((f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith(".")), key=lambda f: natural_key(f.name))
+    if not files and any(folder.glob("*.zstd")):
+        raise InputError(f"{folder} holds a compressed bag without its metadata.yaml; unpack it with: zstd -d --rm {folder}/*.zstd")
     if not files:
         raise InputError(f"no recording in {folder}: it has no images.txt, no metadata.yaml, and no {' '.join(SUFFIXES)} files")
     entries = [(round(i * 1e9 / rate_hz), file) for i, file in enumerate(files)]

@@ -16,7 +16,7 @@ class Recording(Protocol):
     """A stream of images on disk.
 
     `frames()` reads from the beginning at each call, in the order of the file; stamps may repeat or go back. `frame_count` is None where
-    only reading would tell; it counts stored images, damaged ones too. `problems` counts reasons, and is complete when `frames()` has ended.
+    only reading would tell; it and `Frame.index` count stored images, damaged ones too. `problems` counts reasons, and is complete when `frames()` has ended.
     """
 
     @property
