@@ -104,6 +104,11 @@ def test_dotted_opencv_settings_with_old_header(tmp_path):
     assert_camera(load_camera(write(tmp_path, text)), [-0.3, 0.1, 0.0, 0.0, 0.0])
 
 
+def test_echoed_camera_info(tmp_path):
+    text = f"header: {{frame_id: cam}}\nheight: 512\nwidth: 640\ndistortion_model: plumb_bob\nd: [-0.3, 0.1, 0.0, 0.0, 0.0]\nk: {MATRIX}\n---\nheight: 512\n---\n"
+    assert_camera(load_camera(write(tmp_path, text)), [-0.3, 0.1, 0.0, 0.0, 0.0])
+
+
 def test_plain_numbers(tmp_path):
     assert_camera(load_camera(write(tmp_path, "430,431,322.5,251.5\n"), image_size=(640, 512)), [0.0] * 5)
     assert_camera(load_camera(write(tmp_path, "# fx fy cx cy w h\n430 431 322.5 251.5 640 512")), [0.0] * 5)

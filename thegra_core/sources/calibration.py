@@ -205,7 +205,7 @@ def _parse_yaml(text: str, path: Path) -> dict[str, Any]:
     # OpenCV writes a directive that is no YAML 1.1 and tags its matrices, which are plain mappings
     body = re.sub(r"\A\ufeff?%YAML:?\s*[\d.]+\s*\n", "", text).replace("!!opencv-matrix", "")
     try:
-        values = yaml.safe_load(body)
+        values = next(iter(yaml.safe_load_all(body)), None)  # `ros2 topic echo` ends each message with a document mark
     except yaml.YAMLError as error:
         raise CalibrationError(f"{path} is not YAML ({error}); understood are: {_FORMS}") from error
     if not isinstance(values, dict):
