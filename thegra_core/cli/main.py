@@ -92,6 +92,21 @@ def run(
 
 
 @app.command()
+def info(
+    recording: Annotated[Path, typer.Argument(metavar="INPUT", help="ROS 1 or 2 bag, .mcap, image folder (with images.txt or plain) or video.")],
+    topic: Annotated[str | None, typer.Option(help="Image topic to measure; guessed when only one fits.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Tell what a recording holds: topics, images, rate, gaps, calibration, and the command that runs it.
+
+    Example: `thegra info flight.mcap`
+    """
+    from thegra_core.cli.info import info as tell
+
+    tell(recording, topic, as_json)
+
+
+@app.command()
 def score(
     trajectory: Annotated[Path, typer.Argument(help="TUM file: t tx ty tz qx qy qz qw a line.")],
     groundtruth: Annotated[Path, typer.Argument(help="TUM file to score against.")],

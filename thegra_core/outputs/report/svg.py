@@ -17,7 +17,6 @@ SERIES = (BLUE, ORANGE, GREEN, PURPLE, TEAL, PINK, RED, GREY)
 _VARIABLES = {FOREGROUND: "--fg", MUTED: "--muted", GRID: "--grid"} | {c: f"--c{i}" for i, c in enumerate((BLUE, ORANGE, GREEN, PURPLE, PINK, TEAL, RED, GREY), 1)}
 _STYLE: Any = {
     "svg.fonttype": "none",
-    "svg.hashsalt": "thegra",
     "font.size": 9,
     "text.color": FOREGROUND,
     "axes.edgecolor": GRID,
@@ -48,7 +47,7 @@ _STYLE: Any = {
 
 def draw(title: str, size: tuple[float, float], paint: Callable[[Figure], None]) -> str:
     """Inline SVG of what `paint` puts on a figure of `size` inches; `title` is read out by screen readers."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context({**_STYLE, "svg.hashsalt": title}):  # the salt keeps the ids of one figure from meeting those of another
         figure = Figure(figsize=size, layout="constrained")
         paint(figure)
         buffer = io.StringIO()
@@ -62,7 +61,7 @@ def _inline(text: str, title: str) -> str:
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", text)
     text = text.replace("xlink:href", "href")
-    text = re.sub(r'<g id="[A-Za-z0-9]+_[0-9a-z_]+">', "<g>", text)
+    text = re.sub(r'<g id="[\w.]+_[0-9a-z_]+">', "<g>", text)
     text = re.sub(r'<svg ([^>]*?)width="[^"]*"', r"<svg \1", text)
     text = re.sub(r'<svg ([^>]*?)height="[^"]*"', rf'<svg role="img" aria-label="{title}" \1', text)
     for colour, variable in _VARIABLES.items():
