@@ -159,6 +159,15 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
     assert list(tmp_path.iterdir()) == [file]
 
 
+def test_the_checksum_leaves_out_results_that_lie_in_the_input(tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    (folder / "1.png").write_bytes(b"one")
+    before = sha256_of(folder)
+    write_run(make_run(), folder / "out", load_config(), facts(tmp_path, path=folder), None, TIMING)
+    assert yaml.safe_load((folder / "out" / "config.yaml").read_text())["run"]["input"]["sha256"] == before
+
+
 def test_checksum_of_a_folder_sees_names_and_contents(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "1.png").write_bytes(b"one")

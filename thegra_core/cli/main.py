@@ -8,11 +8,10 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from thegra_core.cli import exit_codes
 from thegra_core.cli.weights import app as weights_app
 from thegra_core.errors import ThegraError
 from thegra_core.version import VERSION
-
-EXIT_DONE, EXIT_NOTHING, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
 class _Group(TyperGroup):
@@ -23,10 +22,10 @@ class _Group(TyperGroup):
             return super().invoke(ctx)
         except ThegraError as error:
             typer.echo(f"thegra: {error}", err=True)
-            raise typer.Exit(EXIT_USAGE) from error
+            raise typer.Exit(exit_codes.WRONG_USE) from error
         except KeyboardInterrupt as error:
             typer.echo("thegra: interrupted", err=True)
-            raise typer.Exit(EXIT_INTERRUPTED) from error
+            raise typer.Exit(exit_codes.INTERRUPTED) from error
 
 
 app = typer.Typer(

@@ -60,7 +60,7 @@ class Bar:
         self._console = console
         self._bar = RichProgress(
             TextColumn("{task.fields[state]}"),
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=20),
             MofNCompleteColumn(),
             TextColumn("{task.fields[facts]}"),
             TimeRemainingColumn(compact=True),
@@ -136,7 +136,7 @@ def summary_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         ("held / lost / initializing", f"{metrics['frames_held']} / {metrics['frames_lost']} / {metrics['frames_initializing']}"),
         ("maps, keyframes, landmarks", f"{metrics['maps']}, {metrics['keyframes']}, {metrics['landmarks']}"),
         ("losses, relocalizations", f"{metrics['losses']}, {metrics['relocalizations']}"),
-        ("speed", f"{metrics['fps']} fps, {metrics['ms_per_frame']['p50']} ms a frame (95 %: {metrics['ms_per_frame']['p95']})"),
+        ("speed", _speed(metrics)),
         ("memory", f"{metrics['peak_rss_mb']} MB"),
     ]
     if metrics["frames_bad"]:
@@ -144,12 +144,19 @@ def summary_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
+def _speed(metrics: dict[str, Any]) -> str:
+    median, slow = metrics["ms_per_frame"]["p50"], metrics["ms_per_frame"]["p95"]
+    rate = f"{metrics['fps']:.3g} fps" if metrics["fps"] else "-"
+    return rate if median is None else f"{rate}, {median:.4g} ms a frame (95 %: {slow:.4g})"
+
+
 def _error(metrics: dict[str, Any]) -> str:
     if "ate_rmse" not in metrics:
         return "no ground truth"
     if metrics["ate_rmse"] is None:
         return "fewer than 3 frames with pose and ground truth"
-    return f"{metrics['ate_rmse']:.4g} over {metrics['ate_pairs']} frames; path {metrics['path_length']:.4g}"
+    live = f"; as estimated at the time {metrics['ate_live_rmse']:.4g}" if metrics["ate_live_rmse"] is not None else ""
+    return f"{metrics['ate_rmse']:.4g} over {metrics['ate_pairs']} frames of a path of {metrics['path_length']:.4g}{live}"
 
 
 def without_figures(text: str) -> str:

@@ -15,6 +15,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Protocol
 
+from thegra_core.cli import exit_codes
 from thegra_core.cli.progress import Progress, headline, make_progress, print_summary, without_figures
 from thegra_core.config import ThegraConfig, load_config
 from thegra_core.errors import ConfigError, InputError, ThegraError
@@ -26,8 +27,8 @@ from thegra_core.outputs.viewer import Viewer, make_viewer
 from thegra_core.outputs.write import RecordingFacts, write_run
 from thegra_core.sources.open import camera_for, open_recording
 from thegra_core.sources.recording import Recording
+from thegra_core.version import VERSION
 
-EXIT_DONE, EXIT_NOTHING, EXIT_INTERRUPTED = 0, 1, 130
 _log = logging.getLogger(__name__)
 
 
@@ -101,7 +102,7 @@ def run_recording(options: RunOptions) -> int:
     viewer = make_viewer(options.viewer)
     out = options.out or Path("runs") / f"{recording.name}_{started:%Y%m%dT%H%M%SZ}"
     with _log_file(out), make_progress(options.quiet, _expected_frames(options, recording)) as progress, _interrupts() as interrupted:
-        for line in (f"input {recording.path}", f"arguments {shlex.join(sys.argv[1:])}", *recording.notes):
+        for line in (f"thegra {VERSION}, profile {config.profile}, seed {config.seed}", f"input {recording.path}", f"arguments {shlex.join(sys.argv[1:])}", *recording.notes):
             _log.info("%s", line)
         system = make_system(camera, config)
         done, wall_s = _process(system, _window(recording, options), recording, progress, viewer, interrupted)
@@ -125,8 +126,8 @@ def run_recording(options: RunOptions) -> int:
     if done.error is not None:
         raise done.error
     if done.interrupted:
-        return EXIT_INTERRUPTED
-    return EXIT_DONE if written.metrics["frames_tracked"] else EXIT_NOTHING
+        return exit_codes.INTERRUPTED
+    return exit_codes.DONE if written.metrics["frames_tracked"] else exit_codes.NOTHING_TRACKED
 
 
 def make_system(camera: CameraModel, config: ThegraConfig) -> System:

@@ -24,13 +24,16 @@ def write_atomic(path: Path, content: str | bytes) -> Path:
     return path
 
 
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file; of a folder, that over its files' relative names and contents in sorted order."""
+def sha256_of(path: Path, without: Path | None = None) -> str:
+    """SHA-256 of a file; of a folder, that over its files' relative names and contents in sorted order, leaving out the folder `without`."""
     digest = hashlib.sha256()
     if path.is_file():
         _feed(digest, path)
         return digest.hexdigest()
+    left_out = without.resolve() if without is not None else None
     for file in sorted(p for p in path.rglob("*") if p.is_file()):
+        if left_out is not None and file.resolve().is_relative_to(left_out):
+            continue
         digest.update(f"{file.relative_to(path).as_posix()}\0{file.stat().st_size}\0".encode())
         _feed(digest, file)
     return digest.hexdigest()

@@ -73,7 +73,7 @@ def write_run(run: Run, out_dir: Path, config: ThegraConfig, recording: Recordin
     try:
         out_dir.mkdir(parents=True, exist_ok=True)
         files = [*_write_trajectories(run, out_dir), _write_points(run, out_dir)]
-        files.append(write_atomic(out_dir / "config.yaml", run_config(config, recording)))
+        files.append(write_atomic(out_dir / "config.yaml", run_config(config, recording, out_dir)))
         truth, problem = _read_groundtruth(groundtruth)
         scores = score_run(run, truth) if truth is not None else None
         metrics = run_metrics(run, config, timing, scores, recording.problems)
@@ -86,14 +86,17 @@ def write_run(run: Run, out_dir: Path, config: ThegraConfig, recording: Recordin
     return WrittenRun(out_dir, metrics, tuple(files))
 
 
-def run_config(config: ThegraConfig, recording: RecordingFacts) -> str:
-    """The configuration as YAML that `--config` reads back, and under `run` what else is needed to repeat the run."""
+def run_config(config: ThegraConfig, recording: RecordingFacts, out_dir: Path | None = None) -> str:
+    """The configuration as YAML that `--config` reads back, and under `run` what else is needed to repeat the run.
+
+    The input's checksum leaves out `out_dir`, which may lie inside the input.
+    """
     camera = recording.camera
     facts = {
         "version": VERSION,
         "started_utc": recording.started_utc,
         "command": recording.command,
-        "input": {"name": recording.name, "path": str(recording.path), "topic": recording.topic, "sha256": _input_sha256(recording.path)},
+        "input": {"name": recording.name, "path": str(recording.path), "topic": recording.topic, "sha256": _input_sha256(recording.path, out_dir)},
         "camera": {
             "model": camera.model.value,
             "image_size": list(camera.image_size),
@@ -178,9 +181,9 @@ def _read_groundtruth(path: Path | None) -> tuple[Trajectory | None, InputError 
         return None, error
 
 
-def _input_sha256(path: Path) -> str | None:
+def _input_sha256(path: Path, out_dir: Path | None) -> str | None:
     try:
-        return sha256_of(path)
+        return sha256_of(path, without=out_dir)
     except OSError as error:
         _log.warning("the input's checksum is missing from config.yaml: %s", error)
         return None
