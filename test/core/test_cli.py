@@ -18,10 +18,10 @@ from typer.testing import CliRunner
 from thegra_core.cli import run as run_module
 from thegra_core.cli.config import filter_parameters, parameters
 from thegra_core.cli.main import app
-from thegra_core.cli.progress import without_figures
+from thegra_core.cli.progress import News, without_figures
 from thegra_core.config import ThegraConfig, load_config
 from thegra_core.errors import InputError
-from thegra_core.messages import Run
+from thegra_core.messages import Run, TrackingResult, TrackingState
 from thegra_core.outputs.trajectory import format_tum, make_trajectory, read_tum
 
 COMMANDS = ["run", "info", "score", "config", "doctor", "weights list", "weights fetch", "weights verify"]
@@ -160,6 +160,15 @@ def test_the_reason_for_waiting_is_told_once(play) -> None:
 def test_reasons_that_differ_in_figures_only_are_the_same() -> None:
     assert without_figures("parallax 0.47 deg, 1 needed") == without_figures("parallax 12 deg, 1 needed")
     assert without_figures("parallax 0.47 deg") != without_figures("no parallax: 80 %")
+
+
+def test_reasons_are_told_once_a_state() -> None:
+    def result(state: TrackingState, reason: str = "") -> TrackingResult:
+        return TrackingResult(0, state, reason=reason)
+
+    news, lost, tracking = News(), TrackingState.LOST, TrackingState.TRACKING
+    told = [result(lost, "16 of 25"), result(lost, "no matches"), result(lost, "14 of 25"), result(tracking), result(tracking), result(lost, "9 of 25")]
+    assert [news.is_new(r) for r in told] == [True, True, False, True, False, True]
 
 
 def test_quiet_prints_one_line(play, truth: Path) -> None:

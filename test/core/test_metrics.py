@@ -95,6 +95,12 @@ def test_every_file_is_written(tmp_path: Path, groundtruth: Path) -> None:
     assert len(read_tum(out / "trajectory_map1.txt")) == metrics["frames_tracked_other_maps"]
 
 
+def test_predictions_are_in_the_file_of_the_map_they_belong_to(tmp_path: Path) -> None:
+    write_run(make_run("tthttttthh", other_map_from=8), tmp_path / "out", load_config(), facts(tmp_path), None, TIMING)
+    assert len(read_tum(tmp_path / "out" / "predicted.txt")) == 1
+    assert len(read_tum(tmp_path / "out" / "predicted_map1.txt")) == 2
+
+
 def test_a_second_run_leaves_nothing_of_the_first(tmp_path: Path) -> None:
     out = tmp_path / "out"
     write_run(make_run(other_map_from=17), out, load_config(), facts(tmp_path), None, TIMING)

@@ -172,6 +172,8 @@ def test_events_are_told_in_order_and_never_too_many() -> None:
     assert "first map made" in told[1].text
     assert "after the shutter" in told[3].text
     assert "tracking again" in told[5].text
+    other = events(make_run("iittllltt", other_map_from=7))
+    assert "another map begins, tracking in map 1 (2 frames)" in other[-1].text
     many = events(make_run("tl" * 100))
     assert len(many) == 61
     assert many[-1].text == "... and 140 more changes of state"

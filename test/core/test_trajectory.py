@@ -128,7 +128,8 @@ def test_each_trajectory_of_a_run_holds_its_own_frames() -> None:
     assert _indices(final_trajectory(run, 0)) == [1, 2, 3, 4, 8]
     assert _indices(live_trajectory(run, 0)) == [2, 3, 4, 8]  # frame 1 was localised afterwards: nobody had its pose at the time
     assert _indices(final_trajectory(run, 1)) == [9, 10]
-    assert _indices(predicted_trajectory(run)) == [5, 6]
+    assert _indices(predicted_trajectory(run, 0)) == [5, 6]
+    assert len(predicted_trajectory(run, 1)) == 0
     assert _indices(keyframe_trajectory(run, 0)) == [1, 4]
     assert len(keyframe_trajectory(run, 7)) == 0
 

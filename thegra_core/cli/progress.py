@@ -28,6 +28,23 @@ _COLOURS = {
 }
 
 
+class News:
+    """Tells which results are worth a line: those that change the state, and in it each reason once, whatever its figures."""
+
+    def __init__(self) -> None:
+        self._state: TrackingState | None = None
+        self._said: set[str] = set()
+
+    def is_new(self, result: TrackingResult) -> bool:
+        """Whether this result says what the ones before did not."""
+        if result.state is not self._state:
+            self._state, self._said = result.state, set()
+        elif not result.reason or without_figures(result.reason) in self._said:
+            return False
+        self._said.add(without_figures(result.reason))
+        return True
+
+
 class Progress(Protocol):
     """Told about each frame and stage; used as a context manager."""
 
@@ -70,7 +87,7 @@ class Bar:
         self._task = self._bar.add_task("frames", total=total, state="starting", facts="")
         self._handler = RichHandler(console=console, level=logging.WARNING, show_path=False, show_time=False, markup=False)
         self._began = time.monotonic()
-        self._last: tuple[TrackingState | None, str] = (None, "")
+        self._news = News()
         self._frames = self._keyframes = self._landmarks = 0
 
     def __enter__(self) -> Bar:
@@ -87,9 +104,9 @@ class Bar:
         self._frames += 1
         if result.is_keyframe:
             self._keyframes, self._landmarks = (len(array) for array in scene.current_map())
-        if (told := (result.state, without_figures(result.reason))) != self._last:
-            self._last = told
-            self._console.print(f"  frame {self._frames}: {_coloured(result.state)}{': ' + escape(result.reason) if result.reason else ''}", highlight=False)
+        if self._news.is_new(result):
+            reason = f": {escape(result.reason)}" if result.reason else ""
+            self._console.print(f"  frame {self._frames}: {_coloured(result.state)}{reason}", highlight=False, soft_wrap=True)
         fps = self._frames / max(time.monotonic() - self._began, 1e-9)
         problems = f" · {unreadable} unreadable" if unreadable else ""
         facts = f"{fps:.1f} fps · {self._keyframes} keyframes · {self._landmarks} landmarks{problems}"

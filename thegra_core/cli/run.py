@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from thegra_core.cli import exit_codes
-from thegra_core.cli.progress import Progress, headline, make_progress, print_summary, without_figures
+from thegra_core.cli.progress import News, Progress, headline, make_progress, print_summary
 from thegra_core.config import ThegraConfig, load_config
 from thegra_core.errors import ConfigError, InputError, ThegraError
 from thegra_core.geometry.camera import CameraModel
@@ -70,19 +70,6 @@ class _Done:
     error: ThegraError | None = None
     reason: str = ""
     unreadable: dict[str, int] = field(default_factory=dict)
-
-
-class _Changes:
-    """Logs each change of state, and of the reason for it."""
-
-    def __init__(self) -> None:
-        self._last = ""
-
-    def note(self, index: int, result: TrackingResult) -> None:
-        text = f"{result.state.value}: {result.reason}" if result.reason else result.state.value
-        if without_figures(text) != self._last:
-            self._last = without_figures(text)
-            _log.info("frame %d %s (%d matches, %d inliers)", index, text, result.matches, result.inliers)
 
 
 def run_recording(options: RunOptions) -> int:
@@ -141,14 +128,15 @@ def _process(
     system: System, frames: Iterator[Frame], recording: Recording, progress: Progress, viewer: Viewer, interrupted: Callable[[], bool]
 ) -> tuple[_Done, float]:
     """All frames through the system; returns also the seconds it took."""
-    done, changes, before = _Done(), _Changes(), dict(recording.problems)
+    done, news, before = _Done(), News(), dict(recording.problems)
     begin = time.perf_counter()
     try:
         for frame in frames:
             result = system.process(frame)
             done.frames += 1
             done.reason = result.reason or done.reason
-            changes.note(frame.index, result)
+            if news.is_new(result):
+                _log.info("frame %d %s %s (%d matches, %d inliers)", frame.index, result.state.value, result.reason, result.matches, result.inliers)
             progress.frame(result, system, sum(recording.problems.values()))
             viewer.show(result, system)
             if interrupted():

@@ -57,9 +57,9 @@ def live_trajectory(run: Run, map_id: int) -> Trajectory:
     return make_trajectory((f.stamp_ns, f.world_from_camera_live) for f in run.frames if f.map_id == map_id and f.world_from_camera_live is not None)
 
 
-def predicted_trajectory(run: Run) -> Trajectory:
-    """Poses predicted while the shutter was closed."""
-    return make_trajectory((f.stamp_ns, f.predicted) for f in run.frames if f.predicted is not None)
+def predicted_trajectory(run: Run, map_id: int) -> Trajectory:
+    """Poses predicted while the shutter was closed and one map was tracked; as predicted at the time."""
+    return make_trajectory((f.stamp_ns, f.predicted) for f in run.frames if f.result.map_id == map_id and f.predicted is not None)
 
 
 def keyframe_trajectory(run: Run, map_id: int) -> Trajectory:

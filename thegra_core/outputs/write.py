@@ -125,8 +125,8 @@ def _version_of(distribution: str) -> str | None:
 
 
 def _write_trajectories(run: Run, out_dir: Path) -> list[Path]:
-    for stale in [*out_dir.glob("trajectory_map*.txt"), out_dir / "predicted.txt"]:
-        stale.unlink(missing_ok=True)
+    for stale in [*out_dir.glob("trajectory_map*.txt"), *out_dir.glob("predicted*.txt")]:
+        stale.unlink()
     contents: dict[str, Trajectory] = {
         "trajectory.txt": final_trajectory(run, run.main_map_id),
         "trajectory_live.txt": live_trajectory(run, run.main_map_id),
@@ -134,9 +134,8 @@ def _write_trajectories(run: Run, out_dir: Path) -> list[Path]:
     }
     others = sorted({f.map_id for f in run.frames if f.world_from_camera is not None} - {run.main_map_id})
     contents |= {f"trajectory_map{k}.txt": final_trajectory(run, k) for k in others}
-    predicted = predicted_trajectory(run)
-    if len(predicted):
-        contents["predicted.txt"] = predicted
+    for map_id in sorted({f.result.map_id for f in run.frames if f.predicted is not None}):
+        contents["predicted.txt" if map_id == run.main_map_id else f"predicted_map{map_id}.txt"] = predicted_trajectory(run, map_id)
     return [write_atomic(out_dir / name, format_tum(trajectory)) for name, trajectory in contents.items()]
 
 

@@ -92,7 +92,7 @@ def run_poses(report: ReportInput) -> RunPoses | None:
     estimate = final_trajectory(report.run, report.run.main_map_id).positions
     if len(estimate) == 0:
         return None
-    predicted = predicted_trajectory(report.run).positions
+    predicted = predicted_trajectory(report.run, report.run.main_map_id).positions
     alignment = report.scores.final.alignment if report.scores else None
     if alignment is None or report.scores is None:
         return RunPoses(estimate, predicted, None)
@@ -171,7 +171,7 @@ def _warnings(report: ReportInput) -> list[str]:
         reason = next((f.result.reason for f in reversed(run.frames) if f.result.reason), "")
         told.append("Nothing could be tracked" + (f". The last thing that initialisation said: {reason}" if reason else "."))
     elif m["tracked_pct"] < 50:
-        told.append("Less than half of the frames have a pose; the error says nothing about the rest.")
+        told.append("Less than half of the frames have a pose in the main map; its error says nothing about the rest.")
     if m.get("ate_rel") is not None and m["ate_rel"] > 0.5:
         told.append("The error is of the size of the path itself: the trajectory is wrong, not just inexact.")
     if m["maps"] > 1:

@@ -95,24 +95,28 @@ def events(run: Run) -> list[Event]:
     times = dict(zip((f.index for f in run.frames), times_s(run.frames).tolist(), strict=True))
     told: list[Event] = []
     before: TrackingState | None = None
+    known: set[int] = set()
     for state, group in groupby(run.frames, key=lambda f: f.result.state):
         members = list(group)
-        told.append(Event(times[members[0].index], members[0].index, _describe(before, state, members)))
+        told.append(Event(times[members[0].index], members[0].index, _describe(before, state, members, known)))
         before = state
+        known |= {f.result.map_id for f in members if state is TrackingState.TRACKING}
     if len(told) > _MAX_EVENTS:
         rest = len(told) - _MAX_EVENTS
         told = [*told[:_MAX_EVENTS], Event(told[_MAX_EVENTS].time_s, told[_MAX_EVENTS].frame, f"... and {rest} more changes of state")]
     return told
 
 
-def _describe(before: TrackingState | None, state: TrackingState, frames: list[FrameRecord]) -> str:
+def _describe(before: TrackingState | None, state: TrackingState, frames: list[FrameRecord], known_maps: set[int]) -> str:
     last_reason = next((f.result.reason for f in reversed(frames) if f.result.reason), "")
     because = f": {last_reason}" if last_reason else ""
     count = f"{len(frames)} frame{'s' if len(frames) > 1 else ''}"
     if state is TrackingState.TRACKING:
-        start = {TrackingState.HOLD: "tracking goes on after the shutter", TrackingState.LOST: "tracking again", TrackingState.RELOCALIZING: "relocalised"}
-        default = "tracking from the first frame" if before is None else "first map made, tracking begins"
-        return f"{start.get(before, default) if before else default} ({count})"
+        map_id = frames[0].result.map_id
+        if map_id not in known_maps:
+            return f"{'another map begins' if known_maps else 'first map made'}, tracking in map {map_id} ({count})"
+        again = "tracking goes on after the shutter" if before is TrackingState.HOLD else "tracking again"
+        return f"{again} in map {map_id} ({count})"
     names = {
         TrackingState.WAITING: "waiting for the camera's calibration",
         TrackingState.INITIALIZING: "initializing",
