@@ -39,7 +39,7 @@ class CameraModel:
     image_size (width, height) px.
 
     Raises:
-        CalibrationError: If the focal lengths are not positive and finite or the number of coefficients does not fit the model.
+        CalibrationError: If the focal lengths are not positive and finite, a coefficient is no number, or there are too many for the model.
     """
 
     matrix: FloatArray
@@ -58,6 +58,8 @@ class CameraModel:
             raise CalibrationError(f"{self.model.value} takes at most {wanted} distortion coefficients, got {len(given)}: check distortion_model in the camera file")
         if not np.all(np.isfinite(matrix)) or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
             raise CalibrationError(f"the camera matrix has fx = {matrix[0, 0]:g}, fy = {matrix[1, 1]:g}; both must be positive: give a calibration with --camera FILE")
+        if not np.all(np.isfinite(given)):
+            raise CalibrationError(f"the distortion coefficients {given.tolist()} are not all numbers: check them in the camera file")
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "distortion", np.pad(given, (0, wanted - len(given))))
 
@@ -100,10 +102,10 @@ class CameraModel:
         y = (pixels[:, 1] - k[1, 2]) / k[1, 1]
         x = (pixels[:, 0] - k[0, 2] - k[0, 1] * y) / k[0, 0]
         target = np.stack([x, y], axis=1)
+        if self.model is DistortionModel.EQUIDISTANT:  # bends rays even where all its coefficients are zero
+            return self._undistort_fisheye(target)
         if not np.any(self.distortion):
             return target
-        if self.model is DistortionModel.EQUIDISTANT:
-            return self._undistort_fisheye(target)
         return self._undistort_newton(target)
 
     def bearings(self, pixels: FloatArray) -> FloatArray:
@@ -139,10 +141,11 @@ class CameraModel:
         p = target.copy()
         step = np.full_like(p, np.inf)
         h = 1e-6
+        along_x, along_y = np.array([h, 0.0]), np.array([0.0, h])
         for _ in range(_MAX_ITERATIONS):
             residual = self._distort_normalized(p) - target
-            jx = (self._distort_normalized(p + [h, 0]) - self._distort_normalized(p - [h, 0])) / (2 * h)
-            jy = (self._distort_normalized(p + [0, h]) - self._distort_normalized(p - [0, h])) / (2 * h)
+            jx = (self._distort_normalized(p + along_x) - self._distort_normalized(p - along_x)) / (2 * h)
+            jy = (self._distort_normalized(p + along_y) - self._distort_normalized(p - along_y)) / (2 * h)
             det = jx[:, 0] * jy[:, 1] - jy[:, 0] * jx[:, 1]
             with np.errstate(divide="ignore", invalid="ignore"):
                 step = np.stack([jy[:, 1] * residual[:, 0] - jy[:, 0] * residual[:, 1], jx[:, 0] * residual[:, 1] - jx[:, 1] * residual[:, 0]], axis=1) / det[:, None]

@@ -25,7 +25,7 @@ def triangulate_views(camera_from_world: FloatArray, normalized: FloatArray) -> 
     xy = np.where(seen[..., None], normalized, 0.0)
     p = camera_from_world[None, :, :3, :]
     rows = xy[..., None] * p[:, :, 2:3, :] - p[:, :, :2, :]
-    rows = np.where(seen[..., None, None], rows, 0.0).reshape(len(normalized), -1, 4)
+    rows = np.where(seen[..., None, None], rows, 0.0).reshape(len(normalized), 2 * len(camera_from_world), 4)
     a, b = rows[..., :3], -rows[..., 3]
     normal = np.einsum("nri,nrj->nij", a, a)
     right = np.einsum("nri,nr->ni", a, b)
