@@ -1,4 +1,4 @@
-"""ALIKED (Zhao et al. 2023) through kornia's network, with weights from the cache."""
+"""ALIKED (Zhao et al. 2023): kornia's network with weights from the cache, evaluated only where it is needed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from kornia.feature import ALIKED
 from numpy.typing import NDArray
 
 from thegra_core.config import ExtractorConfig
+from thegra_core.features.aliked_sparse import SparseAliked
 from thegra_core.features.assemble import assemble, scaled_image
 from thegra_core.features.checkpoint import load_checkpoint, load_exactly
 from thegra_core.features.device import resolve_device
@@ -29,27 +30,24 @@ class Aliked:
         threshold = config.detection_threshold if config.detection_threshold > 0 else -1.0
         network = ALIKED(checkpoint, 2 * config.max_keypoints, threshold, config.nms_radius or NMS_RADIUS)
         load_exactly(network, load_checkpoint(checkpoint), checkpoint, missing=("dkd.hw_grid",))
-        self._network = network.eval().to(self._device)
+        self._network = SparseAliked(network.eval().to(self._device))
 
     @torch.inference_mode()
     def extract(self, image: NDArray[np.uint8], stamp_ns: int) -> Features:
         """See `Extractor.extract`."""
         config = self._config
         scaled, scale = scaled_image(image, config.long_side)
-        grey = torch.from_numpy(scaled).to(self._device).float()[None, None] / 255
-        features, score_map = self._network.extract_dense_map(grey.expand(-1, 3, -1, -1))
-        (normalized,), (values,), _ = self._network.dkd(score_map)
+        grey = torch.from_numpy(np.ascontiguousarray(scaled)).to(self._device).float()[None, None] / 255
+        score_map, levels = self._network.dense(grey)
+        (normalized,), (values,), _ = self._network.detect(score_map)
         size = normalized.new_tensor([scaled.shape[1] - 1, scaled.shape[0] - 1])
         pixels = (normalized + 1) / 2 * size
         border = config.border * min(scale)
         inside = ((pixels >= border) & (pixels <= size - border)).all(dim=1) & (values > config.detection_threshold)
         chosen = inside.nonzero()[:, 0]
         chosen = chosen[torch.argsort(values[chosen], descending=True, stable=True)][: config.max_keypoints]
-        descriptors = self._describe(features, normalized[chosen])
-        return assemble(config, stamp_ns, (image.shape[1], image.shape[0]), scale, pixels[chosen].cpu().numpy(), values[chosen].cpu().numpy(), descriptors)
-
-    def _describe(self, features: torch.Tensor, normalized: torch.Tensor) -> NDArray[np.float32]:
-        if len(normalized) == 0:
-            return np.empty((0, features.shape[1]), np.float32)
-        (descriptors,), _ = self._network.desc_head(features, [normalized])
-        return np.asarray(descriptors.cpu().numpy(), np.float32)
+        keypoints, scores = pixels[chosen], values[chosen]
+        descriptors = self._network.describe(levels, keypoints)
+        return assemble(
+            config, stamp_ns, (image.shape[1], image.shape[0]), scale, keypoints.cpu().numpy(), scores.cpu().numpy(), descriptors.cpu().numpy()
+        )

@@ -32,9 +32,9 @@ class Sift:
         """See `Extractor.extract`."""
         scaled, scale = scaled_image(image, self._config.long_side)
         found = _first_at_each_place(self._sift.detect(scaled, None), 2 * self._config.max_keypoints)
-        found, descriptors = self._sift.compute(scaled, found) if found else ([], None)
-        root = _root_sift(descriptors) if descriptors is not None else np.empty((0, 128), np.float32)
-        return assemble(self._config, stamp_ns, (image.shape[1], image.shape[0]), scale, _pixels(found), _relative_response(found), root)
+        described, descriptors = self._sift.compute(scaled, found) if found else ((), None)
+        root = _root_sift(np.asarray(descriptors, np.float32)) if described else np.empty((0, 128), np.float32)
+        return assemble(self._config, stamp_ns, (image.shape[1], image.shape[0]), scale, _pixels(described), _relative_response(described), root)
 
 
 class Orb:
@@ -76,4 +76,4 @@ def _relative_response(found: Sequence[cv2.KeyPoint]) -> NDArray[np.float32]:
 
 def _root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
     shares = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), np.float32(1e-12))
-    return np.sqrt(shares).astype(np.float32)
+    return np.asarray(np.sqrt(shares), np.float32)

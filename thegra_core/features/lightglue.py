@@ -28,7 +28,7 @@ class LightGlue:
         self._extractor = extractor
         self._device = resolve_device(config.device)
         checkpoint = CHECKPOINTS[extractor]
-        network = LightGlueNet(features=None, **_network_settings(config, extractor))
+        network = LightGlueNet(**_network_settings(config, extractor))
         layers = int(network.conf.n_layers)
         # `confidence_thresholds` is derived from the number of layers; `log_assignment.i.r` was never used by the authors' code either
         unused = tuple(f"log_assignment.{layer}.r" for layer in range(layers))
@@ -62,6 +62,7 @@ class LightGlue:
 def _network_settings(config: MatcherConfig, extractor: str) -> dict[str, Any]:
     """kornia's settings of that extractor's network under ours; LighterGlue has no trained early exit, so it never exits early."""
     settings = {key: value for key, value in LightGlueNet.features[_KORNIA_NAMES[extractor]].items() if key != "weights"}
+    settings["features"] = None  # a name here would download
     settings["filter_threshold"] = config.threshold
     if extractor == "xfeat":
         settings["width_confidence"] = min(config.width_confidence, settings["width_confidence"])

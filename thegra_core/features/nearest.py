@@ -42,7 +42,8 @@ def _distances(
     if query.dtype == np.uint8:
         bits = 8.0 * query.shape[1]
         return np.asarray((bits - _signs(query) @ _signs(reference).T) / 2, np.float32), bits
-    return np.sqrt(np.maximum(2 - 2 * (query @ reference.T), 0)).astype(np.float32), None
+    cosines = np.asarray(query, np.float32) @ np.asarray(reference, np.float32).T
+    return np.sqrt(np.maximum(2 - 2 * cosines, 0)).astype(np.float32), None
 
 
 def _mutual(distances: NDArray[np.float32], ratio: float) -> NDArray[np.int32]:
@@ -56,6 +57,6 @@ def _mutual(distances: NDArray[np.float32], ratio: float) -> NDArray[np.int32]:
     return np.stack((rows[mutual], best[mutual]), axis=1).astype(np.int32)
 
 
-def _signs(binary: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _signs(binary: NDArray[np.float32] | NDArray[np.uint8]) -> NDArray[np.float32]:
     """Bits as -1 and 1: their products count equal bits less unequal ones, exactly."""
-    return np.unpackbits(binary, axis=1).astype(np.float32) * 2 - 1
+    return np.unpackbits(np.asarray(binary, np.uint8), axis=1).astype(np.float32) * 2 - 1

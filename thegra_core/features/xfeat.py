@@ -32,7 +32,7 @@ class XFeat:
         """See `Extractor.extract`."""
         config = self._config
         scaled, scale = scaled_image(image, config.long_side)
-        grey = torch.from_numpy(scaled).to(self._device).float()[None, None] / 255
+        grey = torch.from_numpy(np.ascontiguousarray(scaled)).to(self._device).float()[None, None] / 255
         found = self._pipeline.detectAndCompute(grey, top_k=2 * config.max_keypoints, detection_threshold=config.detection_threshold)[0]
         size = np.asarray([scaled.shape[1], scaled.shape[0]])
         seen = np.maximum(_MULTIPLE, size // _MULTIPLE * _MULTIPLE)
