@@ -128,7 +128,7 @@ def test_camera_of_another_size_is_refused(play) -> None:
     assert "640x512" in result.stderr
 
 
-@pytest.mark.parametrize(("option", "value", "told"), [("--groundtruth", "/no/truth.txt", "/no/truth.txt does not exist"), ("--viewer", "paraview", "known: none, rerun")])
+@pytest.mark.parametrize(("option", "value", "told"), [("--groundtruth", "/no/truth.txt", "cannot read the trajectory /no/truth.txt"), ("--viewer", "paraview", "known: none, rerun")])
 def test_wrong_options_of_run_stop_before_the_work(play, option: str, value: str, told: str) -> None:
     result, out = play(make_run(), option, value)
     assert result.exit_code == 2
@@ -182,6 +182,15 @@ def test_quiet_prints_one_line(play, truth: Path) -> None:
 def test_ground_truth_beside_the_input_is_used(play, truth: Path, tmp_path: Path) -> None:
     _, out = play(make_run(), recording=FakeRecording(tmp_path, groundtruth=truth))
     assert "ate_rmse" in json.loads((out / "metrics.json").read_text())
+
+
+def test_ground_truth_beside_the_input_that_is_none_is_left_out(play, tmp_path: Path) -> None:
+    file = tmp_path / "groundtruth.txt"
+    file.write_text("x,y\n")
+    result, out = play(make_run(), recording=FakeRecording(tmp_path, groundtruth=file))
+    assert result.exit_code == 0
+    assert "ate_rmse" not in json.loads((out / "metrics.json").read_text())
+    assert "groundtruth.txt:1" in (out / "thegra.log").read_text()
 
 
 @pytest.mark.parametrize("states", ["iiiii", "iiill"])

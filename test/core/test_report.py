@@ -132,6 +132,12 @@ def test_runs_with_little_in_them_have_a_page(tmp_path: Path, states: str, with_
     assert "No frames were kept." in page.text
 
 
+def test_long_runs_have_a_page_of_bearable_size(tmp_path: Path) -> None:
+    text = report_of(replace(make_run("t" * 6000, noise=0.01), snapshots=()), tmp_path)
+    assert len(text) < 700_000
+    assert "6000 of 6000 frames have a pose" in text
+
+
 def test_warnings_say_what_must_not_be_overlooked(tmp_path: Path) -> None:
     lost = report_of(make_run("iiiii", localized=()), tmp_path)
     assert "Nothing could be tracked. The last thing that initialisation said: the camera has not moved enough" in lost

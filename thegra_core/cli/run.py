@@ -22,7 +22,7 @@ from thegra_core.errors import ConfigError, InputError, ThegraError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import FloatArray, Frame, Run, Snapshot, TrackingResult
 from thegra_core.outputs.metrics import Timing
-from thegra_core.outputs.trajectory import NS_PER_S
+from thegra_core.outputs.trajectory import NS_PER_S, read_tum
 from thegra_core.outputs.viewer import Viewer, make_viewer
 from thegra_core.outputs.write import RecordingFacts, write_run
 from thegra_core.sources.open import camera_for, open_recording
@@ -212,11 +212,18 @@ def _overrides(options: RunOptions) -> dict[str, Any]:
 
 
 def _groundtruth(options: RunOptions, recording: Recording) -> Path | None:
-    if options.groundtruth is None:
-        return recording.groundtruth
-    if not options.groundtruth.is_file():
-        raise InputError(f"--groundtruth {options.groundtruth} does not exist; leave it out to run without scores")
-    return options.groundtruth
+    """The file to score against, read once so that a bad one is told before the work; one that was only found beside the input is left out then."""
+    if options.groundtruth is not None:
+        read_tum(options.groundtruth)
+        return options.groundtruth
+    if recording.groundtruth is None:
+        return None
+    try:
+        read_tum(recording.groundtruth)
+    except InputError as error:
+        recording.notes.append(f"ground truth beside the input not used: {error}")
+        return None
+    return recording.groundtruth
 
 
 def _weights(config: ThegraConfig) -> dict[str, str]:
@@ -241,6 +248,9 @@ def _log_file(out: Path) -> Iterator[None]:
     logger.addHandler(handler)
     try:
         yield
+    except ThegraError as error:
+        _log.error("%s", error)
+        raise
     except Exception:
         _log.exception("the run ended with an error")
         raise
