@@ -52,10 +52,10 @@ def refine_pose(
 
     Four rounds of at most ten Gauss-Newton steps; after each, observations beyond the gate sit out the next round; the Huber kernel is off in the last.
     points_world (N, 3); normalized (N, 2) undistorted; focal in px turns their differences into pixels; weights (N,) 1/px^2; gates (N,) multiply
-    squared pixel residuals before they are compared with chi2 (px^2).
+    squared pixel residuals before they are compared with chi2 (px^2). Undefined (NaN) observations are outliers.
     """
     pose = camera_from_world
-    inliers = np.ones(len(points_world), dtype=bool)
+    inliers = np.isfinite(normalized).all(axis=1)
     hessian = np.eye(6)
     for round_index in range(ROUNDS):
         robust = round_index < ROUNDS - 1
@@ -98,8 +98,10 @@ def _gauss_newton(
 def estimate_pose(points_world: FloatArray, normalized: FloatArray, focal: float, threshold_px: float, seed: int) -> tuple[FloatArray, int]:
     """camera_from_world (4, 4) without a starting pose, and its number of inliers, by PoseLib's locally optimised RANSAC (P3P).
 
-    points_world (N, 3) with N >= 4, normalized (N, 2) undistorted. 0 inliers: no pose found.
+    points_world (N, 3), normalized (N, 2) undistorted. 0 inliers: no pose found, as always with less than 4 points.
     """
+    if len(points_world) < 4:
+        return np.eye(4), 0
     size = float(2 * focal * (np.abs(normalized).max() + 1))
     camera = {"model": "SIMPLE_PINHOLE", "width": int(size), "height": int(size), "params": [focal, 0.0, 0.0]}
     options = {"max_reproj_error": threshold_px, "seed": seed, "min_iterations": 100, "max_iterations": 2000, "success_prob": 0.9999}
