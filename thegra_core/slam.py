@@ -36,6 +36,12 @@ class _Placed:
     reference_id: int = -1
     reference_from_camera: FloatArray | None = None
     afterwards: bool = False
+    bad: bool = False
+
+    @property
+    def may_be_placed(self) -> bool:
+        """A good frame that had no pose at its time."""
+        return not self.bad and self.reference_from_camera is None and self.result.state in (TrackingState.INITIALIZING, TrackingState.LOST)
 
 
 class Slam:
@@ -79,7 +85,7 @@ class Slam:
             output = self._tracking.hold(frame.stamp_ns, shutter.reason) if shutter.shutter is Shutter.CLOSED else self._see(frame)
         self._stage_ms["total"] = 1e3 * (time.perf_counter() - begin)
         result = replace(output.result, stage_ms=dict(self._stage_ms))
-        self._record(frame.index, result)
+        self._record(frame.index, result, bad=bool(trouble))
         return result
 
     def snapshot(self) -> Snapshot | None:
@@ -105,7 +111,7 @@ class Slam:
         late = {p.stamp_ns: p for p in self._tracking.localize_afterwards()}
         for row, placed in enumerate(self._frames):
             found = late.get(placed.result.stamp_ns)
-            if found is not None and placed.reference_from_camera is None and placed.result.state in (TrackingState.INITIALIZING, TrackingState.LOST):
+            if found is not None and placed.may_be_placed:
                 self._frames[row] = replace(
                     placed, map_id=found.map_id, reference_id=found.reference_id, reference_from_camera=found.reference_from_camera, afterwards=True
                 )
@@ -165,9 +171,9 @@ class Slam:
             else:
                 self._closures.append((shutter.stamp_ns, shutter.stamp_ns))
 
-    def _record(self, index: int, result: TrackingResult) -> None:
+    def _record(self, index: int, result: TrackingResult, bad: bool) -> None:
         if result.state is not TrackingState.TRACKING or result.world_from_camera is None:
-            self._frames.append(_Placed(result, index))
+            self._frames.append(_Placed(result, index, bad=bad))
             return
         reference = self._mapper.map(result.map_id).keyframes[result.reference_id]
         relative = np.eye(4) if result.is_keyframe else reference.camera_from_world @ result.world_from_camera
@@ -179,7 +185,7 @@ class Slam:
         if placed.reference_from_camera is not None:
             pose = maps[placed.map_id].keyframes[placed.reference_id].world_from_camera @ placed.reference_from_camera
             return FrameRecord(placed.index, placed.result, pose, placed.map_id, placed.afterwards)
-        if placed.result.state in (TrackingState.INITIALIZING, TrackingState.LOST):
+        if placed.may_be_placed:
             for map_id, current in maps.items():
                 keyframe_id = keyframe_by_stamp.get((map_id, placed.result.stamp_ns))
                 if keyframe_id is not None:

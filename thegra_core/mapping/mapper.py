@@ -14,6 +14,7 @@ from thegra_core.map.map import Map
 from thegra_core.mapping import culling
 from thegra_core.mapping.adjustment import adjust_all, adjust_locally
 from thegra_core.mapping.expansion import expand
+from thegra_core.mapping.propagation import propagate
 from thegra_core.messages import InitialMap, Keyframe, MapSummary, MapUpdate, Matches
 
 logger = logging.getLogger(__name__)
@@ -106,7 +107,10 @@ class Mapper:
         before = editor.next_landmark
         for neighbour in neighbours:
             expand(editor, keyframe.id, neighbour, known[neighbour], self._config.mapping)
-        self._trial[keyframe.map_id].extend(range(before, editor.next_landmark))
+        created = np.arange(before, editor.next_landmark, dtype=np.int64)
+        self._trial[keyframe.map_id].extend(created.tolist())
+        others = [i for i in editor.map.neighbours(keyframe.id, self._config.mapping.propagate_to) if i not in neighbours]
+        propagate(editor, created, others, self._config.tracking)
 
     def _choose_neighbours(self, editor: MapEditor, keyframe: Keyframe) -> list[int]:
         """The reference and the best covisible keyframes, every one far enough away for its baseline to say something."""

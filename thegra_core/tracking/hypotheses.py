@@ -22,10 +22,19 @@ class MotionHypothesis:
     model: str
 
 
-def rotation_only_share(normalized0: FloatArray, normalized1: FloatArray, focal: float, config: InitializationConfig) -> float:
-    """Share of matches (N, 2) that one pure rotation explains to `rotation_only_px`."""
-    _, errors = epipolar.fit_rotation(normalized0, normalized1, config.rotation_only_px / focal)
-    return float((focal * errors < config.rotation_only_px).mean())
+def parallax_to_noise(normalized0: FloatArray, normalized1: FloatArray, focal: float, hypotheses: list[MotionHypothesis]) -> tuple[float, float]:
+    """How far the matches (N, 2) are from a pure rotation, in px (median) and over what noise alone would give.
+
+    The residual of the best pure rotation is noise plus parallax, the epipolar distance of the best hypothesis noise alone. Isotropic Gaussian noise
+    gives medians of 1.177 and 0.674 sigma, a ratio of 1.746, so that the second value is about 1 for a camera that only turns, at any noise level.
+    """
+    _, errors = epipolar.fit_rotation(normalized0, normalized1, 1.0 / focal)
+    flow = focal * float(np.median(errors))
+    noise = min(
+        (focal * float(np.median(epipolar.sampson_errors(epipolar.essential(h.camera1_from_camera0), normalized0, normalized1))) for h in hypotheses),
+        default=np.inf,
+    )
+    return flow, flow / max(1.746 * noise, 1e-9)
 
 
 def motion_hypotheses(
@@ -55,16 +64,17 @@ def _from_essential(
         if matrix is None or matrix.shape != (3, 3):
             return None
         inliers = mask.ravel() > 0
-        count, rotation, t, _ = cv2.recoverPose(matrix, pixels0[inliers], pixels1[inliers], camera)
     except cv2.error:
         return None
-    if count < 8:
+    if inliers.sum() < 8:
         return None
-    motion = epipolar.refine_relative_pose(
-        poses.transform(rotation, t), normalized0[inliers], normalized1[inliers], config.magsac_threshold_px / focal, rng
-    )
+    x0, x1 = normalized0[inliers], normalized1[inliers]
+    rotation_a, rotation_b, t = cv2.decomposeEssentialMat(matrix)
+    candidates = [poses.transform(rotation, sign * t) for rotation in (rotation_a, rotation_b) for sign in (1.0, -1.0)]
+    motion = max(candidates, key=lambda m: _in_front(m, x0, x1))
+    motion = epipolar.refine_relative_pose(motion, x0, x1, config.magsac_threshold_px / focal, rng)
     opposite = poses.transform(motion[:3, :3], -motion[:3, 3])
-    return max((motion, opposite), key=lambda m: _in_front(m, normalized0[inliers], normalized1[inliers]))
+    return max((motion, opposite), key=lambda m: _in_front(m, x0, x1))
 
 
 def _from_homography(normalized0: FloatArray, normalized1: FloatArray, focal: float, config: InitializationConfig) -> list[FloatArray]:

@@ -14,14 +14,10 @@ from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import NO_LANDMARK, Features, InitialMap, Keyframe, Matches
 from thegra_core.optimization.weighting import observation_weights
 from thegra_core.tracking.first_map import FirstMap, TrackTable, distinct, solve_first_map
-from thegra_core.tracking.hypotheses import motion_hypotheses, rotation_only_share
+from thegra_core.tracking.hypotheses import motion_hypotheses, parallax_to_noise
 
 FloatArray = NDArray[np.float64]
 logger = logging.getLogger(__name__)
-
-BETWEEN_VIEWS = 3
-"""Frames between reference and current that take part in judging a start."""
-
 
 @dataclass(slots=True)
 class _Candidate:
@@ -86,10 +82,10 @@ class Initializer:
         x0, x1 = x0[defined], x1[defined]
         if len(x0) < settings.min_matches:
             return f"{len(x0)} matches inside the camera model's field, {settings.min_matches} needed: check the calibration"
-        share = rotation_only_share(x0, x1, self._camera.focal, settings)
-        if share > settings.rotation_only_ratio:
-            return f"no parallax: the camera stands still or only turns ({100 * share:.0f} % of the matches follow a pure rotation): move sideways"
         hypotheses = motion_hypotheses(x0, x1, self._camera.focal, settings, self._rng)
+        flow, ratio = parallax_to_noise(x0, x1, self._camera.focal, hypotheses)
+        if ratio < settings.min_parallax_to_noise:
+            return f"no parallax: a pure rotation explains the matches to {flow:.1f} px, {ratio:.1f} times their noise, {settings.min_parallax_to_noise:g} needed: move sideways"
         views = [reference, *self._between(), current]
         table = self._tabulate(views, matches)
         solved = [m for h in hypotheses if (m := solve_first_map(table, h.camera1_from_camera0, h.model, self._config)) is not None]
@@ -103,6 +99,9 @@ class Initializer:
         logger.debug("start: %s", [(m.model, round(m.cost, 3), int(m.good.sum()), round(m.parallax_deg, 2)) for m in solved])
         if best.good.sum() < settings.min_points:
             return f"{int(best.good.sum())} points triangulated, {settings.min_points} needed: move sideways, or towards more thermal contrast"
+        share = float(best.good.mean())
+        if share < settings.min_inlier_ratio:
+            return f"the best motion explains {100 * share:.0f} % of the matches, {100 * settings.min_inlier_ratio:.0f} % needed: moving objects, or wrong intrinsics"
         if best.parallax_deg < settings.min_parallax_deg:
             return f"parallax {best.parallax_deg:.2f} deg, {settings.min_parallax_deg:g} needed: move sideways"
         others = [m for m in solved[1:] if distinct(best, m)]
@@ -113,7 +112,7 @@ class Initializer:
     def _between(self) -> list[_Candidate]:
         """Frames evenly spread between reference and current, matched to the reference when they are not yet."""
         middle = self._frames[1:-1]
-        count = min(BETWEEN_VIEWS, len(middle))
+        count = min(self._config.initialization.between_views, len(middle))
         chosen = [middle[i] for i in np.unique(np.linspace(0, len(middle) - 1, count + 2).round().astype(int)[1:-1])] if count else []
         for candidate in chosen:
             if candidate.to_reference is None:
