@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +23,7 @@ class LandmarkStore:
     """
 
     def __init__(self) -> None:
-        self._arrays: dict[str, NDArray[np.generic]] = {}
+        self._arrays: dict[str, NDArray[Any]] = {}
         self._alive: BoolArray = np.zeros(0, dtype=bool)
         self._rows = 0
         self._dead = 0
@@ -29,13 +31,13 @@ class LandmarkStore:
     def __len__(self) -> int:
         return self._rows - self._dead
 
-    def column(self, name: str) -> NDArray[np.generic]:
+    def column(self, name: str) -> NDArray[Any]:
         """View of one column over all rows, dead ones too; index it with `rows`."""
         return self._arrays[name][: self._rows] if self._arrays else np.empty(0)
 
     @property
     def points_world(self) -> NDArray[np.float64]:
-        return self.column("points_world")  # type: ignore[return-value]
+        return self.column("points_world") if self._arrays else np.empty((0, 3))
 
     def rows(self, ids: IntArray) -> IntArray:
         """Row (N,) of each id (N,), -1 where the id is unknown, removed or negative."""
@@ -51,9 +53,15 @@ class LandmarkStore:
         return self.column("ids")[self._alive[: self._rows]].astype(np.int64) if self._rows else np.empty(0, np.int64)
 
     def get(self, ids: IntArray) -> LandmarkArrays:
-        """Copies of the landmarks named; all must be alive."""
+        """Copies of the landmarks named.
+
+        Raises:
+            KeyError: If one of them is not alive.
+        """
         rows = self.rows(ids)
-        return LandmarkArrays(**{name: self.column(name)[rows] for name in _COLUMNS})  # type: ignore[arg-type]
+        if np.any(rows < 0):
+            raise KeyError(f"no landmarks {ids[rows < 0].tolist()}")
+        return LandmarkArrays(**{name: self.column(name)[rows] for name in _COLUMNS})
 
     def put(self, landmarks: LandmarkArrays) -> None:
         """Overwrite known landmarks, append new ones; new ids must exceed all earlier ones."""
