@@ -112,14 +112,14 @@ class CameraModel:
         """Unit rays (N, 3) in the camera frame through raw pixels (N, 2)."""
         normalized = self.undistort(pixels)
         rays = np.concatenate([normalized, np.ones((len(normalized), 1))], axis=1)
-        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     def contains(self, pixels: FloatArray, border: float = 0.0) -> NDArray[np.bool_]:
         """(N,) whether raw pixels (N, 2) lie in the image, `border` px inside its edge."""
         width, height = self.image_size
         with np.errstate(invalid="ignore"):
             x, y = pixels[:, 0], pixels[:, 1]
-            return (x >= border) & (x <= width - 1 - border) & (y >= border) & (y <= height - 1 - border)
+            return np.asarray((x >= border) & (x <= width - 1 - border) & (y >= border) & (y <= height - 1 - border))
 
     def _distort_normalized(self, p: FloatArray) -> FloatArray:
         d = self.distortion

@@ -132,8 +132,8 @@ def _minimal_sets(start: FloatArray, x0: FloatArray, x1: FloatArray, steps: int 
         delta = np.linalg.solve(damped, -residual[..., None])[..., 0]
         delta[singular] = 0.0
         length = np.linalg.norm(delta, axis=1, keepdims=True)
-        delta = np.where(length > 0.3, delta * (0.3 / np.maximum(length, 1e-12)), delta)
-        rotation, t = _step(rotation, t, delta)
+        limited: FloatArray = np.where(length > 0.3, delta * (0.3 / np.maximum(length, 1e-12)), delta)
+        rotation, t = _step(rotation, t, limited)
     residual, _ = _residuals_and_jacobian(rotation, t, x0, x1)
     converged = np.linalg.norm(residual, axis=1) < 1e-6
     return [poses.transform(r, direction) for r, direction in zip(rotation[converged], t[converged], strict=True)]
@@ -156,7 +156,7 @@ def _levenberg_marquardt(start: FloatArray, normalized0: FloatArray, normalized1
         residual, jacobian = _residuals_and_jacobian(pose[:3, :3], pose[:3, 3], x0, x1)
         hessian = (jacobian * weights[:, None]).T @ jacobian
         gradient = (jacobian * weights[:, None]).T @ residual
-        delta = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian) + 1e-12), -gradient)
+        delta = np.asarray(np.linalg.solve(hessian + damping * np.diag(np.diag(hessian) + 1e-12), -gradient), dtype=np.float64)
         candidate = poses.transform(*_step(pose[:3, :3], pose[:3, 3], delta))
         new_weights, _, new_cost = weigh(candidate)
         if new_cost < cost:

@@ -21,7 +21,7 @@ def triangulate(camera0_from_world: FloatArray, camera1_from_world: FloatArray, 
 
 def triangulate_views(camera_from_world: FloatArray, normalized: FloatArray) -> FloatArray:
     """points_world (N, 3) seen in V views: transforms (V, 4, 4), undistorted coordinates (N, V, 2), NaN where a view has no observation."""
-    seen = np.isfinite(normalized).all(axis=2)
+    seen = np.asarray(np.isfinite(normalized).all(axis=2))
     xy = np.where(seen[..., None], normalized, 0.0)
     p = camera_from_world[None, :, :3, :]
     rows = xy[..., None] * p[:, :, 2:3, :] - p[:, :, :2, :]
@@ -29,7 +29,7 @@ def triangulate_views(camera_from_world: FloatArray, normalized: FloatArray) -> 
     a, b = rows[..., :3], -rows[..., 3]
     normal = np.einsum("nri,nrj->nij", a, a)
     right = np.einsum("nri,nr->ni", a, b)
-    good = np.linalg.cond(normal) < 1e14
+    good = np.asarray(np.linalg.cond(normal)) < 1e14
     points = np.full((len(normalized), 3), np.nan)
     points[good] = np.linalg.solve(normal[good], right[good][..., None])[..., 0]
     return points

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,7 @@ def visible_landmarks(
     ok &= camera.contains(pixels)
     keep = np.flatnonzero(ok)
     descriptors = landmarks.column("descriptors")[rows[keep]] if len(keep) else np.empty((0, 1), np.float32)
-    return VisibleLandmarks(ids[keep], pixels[keep], descriptors)  # type: ignore[arg-type]
+    return VisibleLandmarks(ids[keep], pixels[keep], descriptors)
 
 
 def match_by_projection(
@@ -88,7 +89,7 @@ def match_by_projection(
     return landmark[unique], candidates[keypoint[unique]]
 
 
-def descriptor_similarity(a: NDArray[np.generic], b: NDArray[np.generic]) -> FloatArray:
+def descriptor_similarity(a: NDArray[Any], b: NDArray[Any]) -> FloatArray:
     """(N,) cosine of float descriptors (N, D) of unit norm; 1 - 2 * Hamming share of binary ones (N, D) uint8."""
     if a.dtype == np.uint8:
         bits = np.unpackbits(np.bitwise_xor(a, b), axis=1).sum(axis=1)

@@ -55,7 +55,7 @@ def refine_pose(
     squared pixel residuals before they are compared with chi2 (px^2). Undefined (NaN) observations are outliers.
     """
     pose = camera_from_world
-    inliers = np.isfinite(normalized).all(axis=1)
+    inliers: BoolArray = np.asarray(np.isfinite(normalized).all(axis=1))
     hessian = np.eye(6)
     for round_index in range(ROUNDS):
         robust = round_index < ROUNDS - 1
@@ -67,7 +67,7 @@ def refine_pose(
     count = int(inliers.sum())
     squared = (focal * triangulation.reprojection_errors(pose, points_world[inliers], normalized[inliers])) ** 2
     variance = float((weights[inliers] * squared).sum() / max(2 * count - 6, 1)) if count else 1.0
-    covariance = max(variance, 1e-12) * np.linalg.pinv(hessian, hermitian=True)
+    covariance = np.asarray(max(variance, 1e-12) * np.linalg.pinv(hessian, hermitian=True), dtype=np.float64)
     return PoseEstimate(pose, inliers, covariance)
 
 

@@ -64,11 +64,11 @@ def distinct(a: FirstMap, b: FirstMap) -> bool:
     rotation = poses.rotation_angle(a.world_from_camera[-1][:3, :3].T @ b.world_from_camera[-1][:3, :3])
     ta, tb = a.world_from_camera[-1][:3, 3], b.world_from_camera[-1][:3, 3]
     cosine = float(ta @ tb / max(np.linalg.norm(ta) * np.linalg.norm(tb), 1e-12))
-    return rotation > np.radians(1.0) or cosine < np.cos(np.radians(10.0))
+    return bool(rotation > np.radians(1.0) or cosine < np.cos(np.radians(10.0)))
 
 
 def _well_placed(points: FloatArray, camera0: FloatArray, camera1: FloatArray, x0: FloatArray, x1: FloatArray, limit: float) -> BoolArray:
-    finite = np.isfinite(points).all(axis=1)
+    finite = np.asarray(np.isfinite(points).all(axis=1))
     safe = np.where(finite[:, None], points, 0.0)
     return (
         finite & (triangulation.reprojection_errors(camera0, safe, x0) < limit) & (triangulation.reprojection_errors(camera1, safe, x1) < limit)

@@ -47,7 +47,7 @@ class FrameView:
     def __init__(self, features: Features, current: Map, config: ThegraConfig) -> None:
         self.features = features
         self.normalized = current.camera.undistort(features.keypoints.astype(np.float64))
-        self.defined = np.isfinite(self.normalized).all(axis=1)
+        self.defined = np.asarray(np.isfinite(self.normalized).all(axis=1))
         self.weights = observation_weights(features.scores, config.weighting)
         self.gates = gate_weights(self.weights, config.weighting)
         self.focal = current.camera.focal
