@@ -14,6 +14,7 @@ from thegra_core.config import MatcherConfig
 from thegra_core.errors import ConfigError
 from thegra_core.features.checkpoint import load_checkpoint, load_exactly
 from thegra_core.features.device import resolve_device
+from thegra_core.features.lightglue_layers import speed_up
 from thegra_core.messages import Features, Matches
 
 CHECKPOINTS = {"superpoint": "superpoint_lightglue", "aliked": "aliked_lightglue", "aliked-n16rot": "aliked_lightglue", "xfeat": "xfeat-lighterglue"}
@@ -33,6 +34,8 @@ class LightGlue:
         # `confidence_thresholds` is derived from the number of layers; `log_assignment.i.r` was never used by the authors' code either
         unused = tuple(f"log_assignment.{layer}.r" for layer in range(layers))
         load_exactly(network, _renamed(load_checkpoint(checkpoint)), checkpoint, missing=("confidence_thresholds",), ignored_prefixes=unused)
+        with torch.no_grad():
+            speed_up(network)
         self._network = network.eval().to(self._device)
 
     @torch.inference_mode()
