@@ -20,6 +20,11 @@ BoolArray = NDArray[np.bool_]
 
 FIXED_SIGMA = 1e-6
 """Standard deviation (rad, map units) that holds a fixed pose."""
+SCALE_SIGMA = 0.1
+"""Standard deviation, in its own length, of the distance that holds a free scale. Nothing in the images speaks against it, so a loose one holds as
+well as a tight one; a tight one would let the poses move only along a sphere and stop every step that is larger than its width."""
+GROSS = 16.0
+"""Times the gate, or the median if that is more: squared errors at the start that are no error of the start."""
 WEIGHT_STEPS_PER_OCTAVE = 4
 """Weights share noise models on a logarithmic grid this fine: a model for each observation would double the time to build the graph."""
 
@@ -55,7 +60,7 @@ def bundle_adjust(problem: BundleProblem, huber_px: float, chi2_px2: float, iter
 
     A solve that gtsam gives up on (an indeterminate system) returns the problem's own poses and points.
     """
-    used = ~_outliers(problem, problem.world_from_camera, problem.points_world, np.inf)
+    used = ~_outliers(problem, problem.world_from_camera, problem.points_world, _gross(problem, chi2_px2))
     camera, points = problem.world_from_camera, problem.points_world
     for stage_iterations in (max(iterations // 2, 1), iterations):
         camera, points = _solve(problem, camera, points, used, huber_px, stage_iterations)
@@ -78,6 +83,14 @@ def _outliers(problem: BundleProblem, world_from_camera: FloatArray, points_worl
         return ~(problem.gates * squared_errors(problem, world_from_camera, points_world) < chi2_px2)
 
 
+def _gross(problem: BundleProblem, chi2_px2: float) -> float:
+    """Squared error (px^2) beyond which an observation is left out from the start: Huber's kernel gives each wrong match the pull of a good one, and
+    where the baseline is short many of them together bend the scene. Wide enough for a start that is bad as a whole."""
+    errors = problem.gates * squared_errors(problem, problem.world_from_camera, problem.points_world)
+    finite = errors[np.isfinite(errors)]
+    return max(GROSS * chi2_px2, GROSS * float(np.median(finite))) if len(finite) else np.inf
+
+
 def _solve(
     problem: BundleProblem, world_from_camera: FloatArray, points_world: FloatArray, used: BoolArray, huber_px: float, iterations: int
 ) -> tuple[FloatArray, FloatArray]:
@@ -97,7 +110,9 @@ def _solve(
             graph.add(gtsam.PriorFactorPose3(X(int(row)), pose, held))
     for row in point_rows:
         values.insert(P(int(row)), points_world[row])
-    _hold_scale(graph, world_from_camera, problem.fixed, keyframe_rows)
+    scale_from = _scale_baseline(world_from_camera, problem.fixed, keyframe_rows)
+    if scale_from is not None:
+        _hold_scale(graph, world_from_camera, *scale_from)
     _add_projections(graph, problem, used, huber_px)
 
     ordering = gtsam.Ordering()
@@ -120,19 +135,35 @@ def _solve(
             camera[row] = result.atPose3(X(int(row))).matrix()
     for row in point_rows:
         points[row] = result.atPoint3(P(int(row)))
+    if scale_from is not None:
+        _restore_scale(world_from_camera, camera, points, keyframe_rows, point_rows, *scale_from)
     return camera, points
 
 
-def _hold_scale(graph: gtsam.NonlinearFactorGraph, world_from_camera: FloatArray, fixed: BoolArray, keyframe_rows: IntArray) -> None:
-    """With a single fixed pose the scale is free: keep the distance from it to the farthest other pose."""
+def _scale_baseline(world_from_camera: FloatArray, fixed: BoolArray, keyframe_rows: IntArray) -> tuple[int, int] | None:
+    """With a single fixed pose the scale is free: rows of that pose and of the one farthest from it, whose distance shall stay."""
     held = keyframe_rows[fixed[keyframe_rows]]
     if len(held) != 1:
-        return
+        return None
     distance = np.linalg.norm(world_from_camera[keyframe_rows, :3, 3] - world_from_camera[held[0], :3, 3], axis=1)
     far = int(np.argmax(distance))
-    if distance[far] > 0:
-        model = gtsam.noiseModel.Isotropic.Sigma(1, 1e-6 * float(distance[far]))
-        graph.add(gtsam.RangeFactorPose3(X(int(held[0])), X(int(keyframe_rows[far])), float(distance[far]), model))
+    return (int(held[0]), int(keyframe_rows[far])) if distance[far] > 0 else None
+
+
+def _hold_scale(graph: gtsam.NonlinearFactorGraph, world_from_camera: FloatArray, held: int, far: int) -> None:
+    distance = float(np.linalg.norm(world_from_camera[far, :3, 3] - world_from_camera[held, :3, 3]))
+    graph.add(gtsam.RangeFactorPose3(X(held), X(far), distance, gtsam.noiseModel.Isotropic.Sigma(1, SCALE_SIGMA * distance)))
+
+
+def _restore_scale(
+    before: FloatArray, camera: FloatArray, points: FloatArray, keyframe_rows: IntArray, point_rows: IntArray, held: int, far: int
+) -> None:
+    """Take out what little the scale has drifted, in place, about the fixed pose."""
+    center = before[held, :3, 3]
+    factor = np.linalg.norm(before[far, :3, 3] - center) / max(float(np.linalg.norm(camera[far, :3, 3] - center)), 1e-12)
+    free = keyframe_rows[keyframe_rows != held]
+    camera[free, :3, 3] = center + factor * (camera[free, :3, 3] - center)
+    points[point_rows] = center + factor * (points[point_rows] - center)
 
 
 def _add_projections(graph: gtsam.NonlinearFactorGraph, problem: BundleProblem, used: BoolArray, huber_px: float) -> None:
