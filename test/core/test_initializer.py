@@ -7,10 +7,12 @@ import pytest
 from synthetic import CAMERA, FakeMatcher, World, cloud, look, motion_error, no_features, observe, plane, sideways, stamp
 
 from thegra_core.config import InitializationConfig, ThegraConfig
-from thegra_core.geometry import poses
+from thegra_core.geometry import poses, triangulation
 from thegra_core.geometry.camera import CameraModel, DistortionModel
 from thegra_core.messages import InitialMap
-from thegra_core.tracking.hypotheses import motion_hypotheses, rotation_only_share
+from thegra_core.tracking import first_map
+from thegra_core.tracking import initializer as initializer_module
+from thegra_core.tracking.hypotheses import MotionHypothesis, motion_hypotheses, parallax_to_noise
 from thegra_core.tracking.initializer import Initializer
 
 CONFIG = ThegraConfig()
@@ -107,7 +109,7 @@ def test_a_static_camera_never_starts_a_map() -> None:
     for seed in range(10):
         initial, _, said = run(cloud(seed=seed), [look([0, 0, 0])] * 10, offset=100 * seed, noise_px=0.5)
         assert initial is None
-        assert "stands still" in said[-1]
+        assert "rotation" in said[-1]
 
 
 def test_a_noisy_camera_with_a_short_focal_length_that_stands_or_turns_never_starts_a_map() -> None:
@@ -151,6 +153,19 @@ def test_a_plane_waits_or_starts_right(tilt_deg: float) -> None:
         rotation, moved = motion_error(*true_relative(path, initial, 1000 * seed))
         assert rotation < 1.0 and moved < 10.0, f"seed {seed}: wrong map at frame {index} ({rotation:.2f} deg, {moved:.1f} deg)"
     assert started >= 1, "never starting at all would pass the rest of this test"
+
+
+@pytest.mark.parametrize(("tilt_deg", "seed"), [(20.0, 4), (20.0, 9), (35.0, 7), (20.0, 6), (35.0, 9)])
+def test_a_plane_with_wrong_matches_waits_or_starts_right(tilt_deg: float, seed: int) -> None:
+    """Frames between reference and current are placed against nearly flat points: a single one placed wrong decides for the wrong motion."""
+    direction = np.random.default_rng(seed).normal(size=3) * [1, 0.5, 0.3]
+    direction /= np.linalg.norm(direction)
+    path = [look(0.06 * i * direction, 0.3 * i, 0.1 * i) for i in range(10)]
+    for wrong in (0.1, 0.2):
+        initial, index, _ = run(plane(seed=seed, tilt_deg=tilt_deg), path, FakeMatcher(wrong=wrong), offset=1000 * seed, clutter=10)
+        if initial is not None:
+            rotation, moved = motion_error(*true_relative(path, initial, 1000 * seed))
+            assert rotation < 1.0 and moved < 12.0, f"wrong map at frame {index} ({rotation:.2f} deg, {moved:.1f} deg)"
 
 
 def test_it_says_what_is_missing() -> None:
@@ -225,13 +240,18 @@ def test_the_same_frames_start_the_same_map() -> None:
     assert [k.world_from_camera.tobytes() for k in maps[0].keyframes] == [k.world_from_camera.tobytes() for k in maps[1].keyframes]
 
 
-def test_share_of_a_rotation() -> None:
-    settings = InitializationConfig()
+@pytest.mark.parametrize("noise_px", [0.3, 1.0, 2.0])
+def test_parallax_over_noise_is_about_one_for_a_turn_at_any_noise(noise_px: float) -> None:
     rng = np.random.default_rng(0)
-    x0 = rng.uniform(-0.5, 0.5, (100, 2))
-    assert rotation_only_share(x0, x0 + rng.normal(0, 0.3 / 260, x0.shape), 260.0, settings) == 1.0
-    shifted = x0 + np.where(np.arange(100)[:, None] < 40, rng.uniform(10, 30, (100, 1)) / 260, 0.0)
-    assert rotation_only_share(x0, shifted, 260.0, settings) == pytest.approx(0.6, abs=0.05)
+    x0 = rng.uniform(-0.5, 0.5, (2000, 2))
+    x1 = x0 + rng.normal(0, noise_px / 520, x0.shape)
+    any_motion = [MotionHypothesis(poses.transform(np.eye(3), t), "essential") for t in ([1.0, 0, 0], [0, 1.0, 0])]
+    flow, ratio = parallax_to_noise(x0, x1, 520.0, any_motion)
+    assert flow == pytest.approx(1.177 * noise_px, rel=0.1)
+    # the Sampson distance of equal noise in both views is that of one view over the square root of 2
+    assert 0.8 < ratio < 1.7
+    moved = x1 + np.stack([rng.uniform(20, 60, 2000) / 520, np.zeros(2000)], axis=1)
+    assert parallax_to_noise(x0, moved, 520.0, any_motion)[1] > 3.5
 
 
 def test_the_true_motion_over_a_plane_is_among_the_hypotheses() -> None:
@@ -244,3 +264,36 @@ def test_the_true_motion_over_a_plane_is_among_the_hypotheses() -> None:
         found = motion_hypotheses(x0, x1 + rng.normal(0, 0.2 / 520, x1.shape), 520.0, InitializationConfig(), rng)
         assert min(max(motion_error(h.camera1_from_camera0, motion)) for h in found if h.model == "homography") < 2.0
         assert all(np.linalg.norm(h.camera1_from_camera0[:3, 3]) == pytest.approx(1.0) for h in found)
+
+
+def test_frames_between_are_placed_under_the_true_motion_whatever_was_matched_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each view must explain its right matches to about their noise once everything is adjusted; else the true motion looks worse than a plane's false one."""
+    tried: list[tuple[first_map.TrackTable, np.ndarray]] = []
+    solve = first_map.solve_first_map
+
+    def note(table: first_map.TrackTable, motion: np.ndarray, model: str, config: ThegraConfig) -> first_map.FirstMap | None:
+        tried.append((table, motion))
+        return solve(table, motion, model, config)
+
+    monkeypatch.setattr(initializer_module, "solve_first_map", note)
+    medians = []
+    for tilt_deg, seed in ((20.0, 9), (35.0, 7), (20.0, 4)):
+        direction = np.random.default_rng(seed).normal(size=3) * [1, 0.5, 0.3]
+        direction /= np.linalg.norm(direction)
+        path = [look(0.06 * i * direction, 0.3 * i, 0.1 * i) for i in range(10)]
+        initializer = Initializer(CAMERA, CONFIG, FakeMatcher(0.1))
+        for index, pose in enumerate(path):
+            tried.clear()
+            answer = initializer.add(observe(plane(seed=seed, tilt_deg=tilt_deg), pose, stamp(index + 1000 * seed), 0.3, 0.9, 10), None, 0, 0)
+            true = poses.inverse(pose) @ path[0]
+            for table, motion in tried:
+                solved = solve(table, motion, "", CONFIG) if max(motion_error(motion, true)) < 5 and index >= 4 else None
+                if solved is not None:
+                    cameras = [poses.inverse(camera) for camera in solved.world_from_camera]
+                    errors = [table.focal * triangulation.reprojection_errors(c, solved.points_world[solved.good], x[solved.good])
+                              for c, x in zip(cameras, table.normalized, strict=True)]  # fmt: skip
+                    medians += [float(np.nanmedian(e)) for e in errors]
+            if isinstance(answer, InitialMap):
+                break
+    assert len(medians) > 20
+    assert max(medians) < 0.6, "px; 0.38 where all is well, 1.0 with one view in the wrong place"

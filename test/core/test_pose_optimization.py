@@ -62,6 +62,22 @@ def test_the_truth_is_found_among_outliers(seed: int) -> None:
     assert np.abs(error[:3]).max() < 5e-4 and np.abs(error[3:]).max() < 3e-3
 
 
+@pytest.mark.parametrize("chi2", [5.991, 96.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_outliers_do_not_pull_a_good_start_away(seed: int, chi2: float) -> None:
+    """A nearly flat scene far away holds a pose only weakly; what is grossly wrong at the start must not push it out of its basin."""
+    rng = np.random.default_rng(seed)
+    points = np.concatenate([rng.uniform(-6, 6, (120, 2)), rng.uniform(15, 18, (120, 1))], axis=1)
+    pose = poses.transform(poses.so3_exp([0.02, -0.01, 0.01]), [0.2, -0.3, 0.2])
+    seen = poses.apply(pose, points)
+    normalized = seen[:, :2] / seen[:, 2:] + rng.normal(0, 0.3 / FOCAL, (120, 2))
+    normalized[:25] = normalized[rng.permutation(25) + 40]
+    ones = np.ones(120)
+    found = refine_pose(pose, points, normalized, FOCAL, ones, ones, chi2)
+    assert found.inliers[25:].mean() > 0.97 and not found.inliers[:25].sum() > 3
+    assert np.linalg.norm(difference(found.camera_from_world, pose)[3:]) < 0.2
+
+
 def test_exact_observations_give_the_exact_pose() -> None:
     pose, points, normalized = view(11)
     ones = np.ones(len(points))

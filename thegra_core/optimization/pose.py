@@ -13,6 +13,8 @@ from thegra_core.geometry import poses, triangulation
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 ROUNDS, STEPS = 4, 10
+GROSS = 16.0
+"""Times the gate, or the median if that is more: squared errors at the start that are no error of the start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +52,15 @@ def refine_pose(
 ) -> PoseEstimate:
     """Least robust weighted reprojection error over one pose.
 
-    Four rounds of at most ten Gauss-Newton steps; after each, observations beyond the gate sit out the next round; the Huber kernel is off in the last.
+    Four rounds of at most ten Gauss-Newton steps; after each, observations beyond the gate sit out the next round, grossly wrong ones the first; the
+    Huber kernel is off in the last.
     points_world (N, 3); normalized (N, 2) undistorted; focal in px turns their differences into pixels; weights (N,) 1/px^2; gates (N,) multiply
     squared pixel residuals before they are compared with chi2 (px^2). Undefined (NaN) observations are outliers.
     """
     pose = camera_from_world
-    inliers: BoolArray = np.asarray(np.isfinite(normalized).all(axis=1))
+    start = gates * (focal * triangulation.reprojection_errors(pose, points_world, normalized)) ** 2
+    finite = start[np.isfinite(start)]
+    inliers: BoolArray = start < GROSS * max(chi2, float(np.median(finite)) if len(finite) else np.inf)
     hessian = np.eye(6)
     for round_index in range(ROUNDS):
         robust = round_index < ROUNDS - 1

@@ -1,0 +1,279 @@
+"""Tracking and mapping on a synthetic world, message by message."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic import CAMERA, FakeMatcher, World, cloud, loop, no_features, observe, room, sideways, stamp
+
+from thegra_core.config import ThegraConfig
+from thegra_core.geometry import poses
+from thegra_core.geometry.alignment import umeyama
+from thegra_core.map.map import Map
+from thegra_core.mapping.mapper import Mapper
+from thegra_core.messages import Features, MapUpdate, TrackingState
+from thegra_core.tracking.motion import MotionModel
+from thegra_core.tracking.stage import TrackingOutput, TrackingStage
+
+CONFIG = ThegraConfig()
+
+
+class Pair:
+    """Tracking and mapping as `Slam` wires them, with every output kept."""
+
+    def __init__(self, config: ThegraConfig = CONFIG, matcher: FakeMatcher | None = None) -> None:
+        self.matcher = matcher or FakeMatcher()
+        self.tracking = TrackingStage(CAMERA, config, self.matcher)
+        self.mapper = Mapper(CAMERA, config, self.matcher)
+        self.outputs: list[TrackingOutput] = []
+        self.updates: list[MapUpdate] = []
+
+    def see(self, features: Features) -> TrackingOutput:
+        reference = self.tracking.reference_features
+        output = self.tracking.process(features, None if reference is None else self.matcher.match(features, reference))
+        update = None
+        if output.initial_map is not None:
+            update = self.mapper.initialize(output.initial_map)
+        elif output.keyframe is not None:
+            update = self.mapper.insert(output.keyframe)
+        if update is not None:
+            self.tracking.apply(update)
+            self.updates.append(update)
+        self.outputs.append(output)
+        return output
+
+    def run(self, world: World, path: list[np.ndarray], begin: int = 0, noise_px: float = 0.3) -> None:
+        for index, pose in enumerate(path, start=begin):
+            self.see(observe(world, pose, stamp(index), noise_px, 0.9, 10))
+
+
+def position_error(outputs: list[TrackingOutput], path: list[np.ndarray]) -> tuple[float, int]:
+    """Root mean square of positions after a similarity alignment over the length of the path, and how many frames had one."""
+    pairs = [(o.result.world_from_camera[:3, 3], p[:3, 3]) for o, p in zip(outputs, path, strict=True) if o.result.state is TrackingState.TRACKING]
+    found, true = np.array([a for a, _ in pairs]), np.array([b for _, b in pairs])
+    scale, rotation, translation = umeyama(found, true)
+    length = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+    return float(np.sqrt(((scale * found @ rotation.T + translation - true) ** 2).sum(axis=1).mean()) / length), len(pairs)
+
+
+@pytest.fixture(scope="module")
+def walk() -> Pair:
+    pair = Pair()
+    pair.run(cloud(count=600, seed=1, low=(-4, -3, 3), high=(8, 3, 8)), sideways(60, 0.05))
+    return pair
+
+
+def test_a_walk_is_tracked(walk: Pair) -> None:
+    error, tracked = position_error(walk.outputs, sideways(60, 0.05))
+    assert error < 0.005
+    assert tracked >= 54
+    states = [o.result.state for o in walk.outputs]
+    first = states.index(TrackingState.TRACKING)
+    assert set(states[:first]) == {TrackingState.INITIALIZING} and set(states[first:]) == {TrackingState.TRACKING}
+    assert all(o.result.reason for o in walk.outputs[:first])
+
+
+def test_results_are_whole(walk: Pair) -> None:
+    for output in walk.outputs:
+        result = output.result
+        assert result.stamp_ns >= stamp(0)
+        if result.state is not TrackingState.TRACKING:
+            assert result.world_from_camera is None
+            continue
+        assert result.world_from_camera is not None and result.covariance is not None and output.landmark_ids is not None
+        assert np.isfinite(result.world_from_camera).all()
+        np.testing.assert_allclose(result.world_from_camera[:3, :3] @ result.world_from_camera[:3, :3].T, np.eye(3), atol=1e-9)
+        assert (np.linalg.eigvalsh(result.covariance) > 0).all()
+        seen = output.landmark_ids[output.landmark_ids >= 0]
+        assert len(np.unique(seen)) == len(seen) == result.inliers <= result.visible
+        assert result.map_id == 0
+
+
+def test_covariance_predicts_the_error_to_the_next_frame(walk: Pair) -> None:
+    """Relative rotation of neighbouring frames against their covariances; the map's error is common to both."""
+    path = sideways(60, 0.05)
+    ratios = []
+    for i in range(20, 59):
+        a, b = walk.outputs[i].result, walk.outputs[i + 1].result
+        found = poses.inverse(a.world_from_camera) @ b.world_from_camera
+        true = poses.inverse(path[i]) @ path[i + 1]
+        error = poses.so3_log(found[:3, :3].T @ true[:3, :3])
+        ratios.append(float(error @ error / np.trace(a.covariance[:3, :3] + b.covariance[:3, :3])))
+    assert 0.3 < np.mean(ratios) < 3.0
+
+
+def test_keyframes_are_numbered_and_refer_to_earlier_ones(walk: Pair) -> None:
+    ids: list[int] = []
+    for output in walk.outputs:
+        if output.initial_map is not None:
+            ids += [k.id for k in output.initial_map.keyframes]
+        if output.keyframe is not None:
+            assert output.keyframe.reference_id in ids
+            assert output.keyframe.stamp_ns == output.result.stamp_ns
+            assert output.result.reference_id == output.keyframe.id
+            ids.append(output.keyframe.id)
+            assert output.keyframe.seen is not None
+            assert (output.keyframe.seen.found <= output.keyframe.seen.visible).all()
+    assert ids == list(range(len(ids)))
+    assert len(ids) > 5
+
+
+def test_a_second_replica_is_equal_to_the_map(walk: Pair) -> None:
+    replica, original = Map(0, CAMERA), walk.mapper.map(0)
+    for update in walk.updates:
+        replica.apply(update)
+    assert list(replica.keyframes) == list(original.keyframes)
+    for i, keyframe in original.keyframes.items():
+        assert replica.keyframes[i].world_from_camera.tobytes() == keyframe.world_from_camera.tobytes()
+        np.testing.assert_array_equal(replica.keyframes[i].landmark_ids, keyframe.landmark_ids)
+    ids = original.landmarks.alive_ids()
+    np.testing.assert_array_equal(replica.landmarks.alive_ids(), ids)
+    mine, theirs = replica.landmarks.get(ids), original.landmarks.get(ids)
+    for name in mine.__slots__:
+        np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name), name)
+    assert replica.covisibility == original.covisibility
+    assert [u.version for u in walk.updates] == list(range(1, len(walk.updates) + 1))
+
+
+def test_the_map_is_right_up_to_a_similarity(walk: Pair) -> None:
+    """Each landmark is one point of the world, and one point of the world is at most a few landmarks."""
+    world = cloud(count=600, seed=1, low=(-4, -3, 3), high=(8, 3, 8))
+    current = walk.mapper.map(0)
+    ids = current.landmarks.alive_ids()
+    landmarks = current.landmarks.get(ids)
+    similarity = landmarks.descriptors @ world.descriptors.T
+    origin = similarity.argmax(axis=1)
+    assert (similarity.max(axis=1) > 0.99).mean() > 0.98
+    assert np.unique(origin).size > 0.95 * len(ids), "one point of the world is one landmark"
+    scale, rotation, translation = umeyama(landmarks.points_world, world.points[origin])
+    error = np.linalg.norm(scale * landmarks.points_world @ rotation.T + translation - world.points[origin], axis=1)
+    assert np.median(error) < 0.05 and np.percentile(error, 95) < 0.5
+    for keyframe in current.keyframes.values():
+        seen = keyframe.landmark_ids >= 0
+        agree = (keyframe.features.descriptors[seen] * current.landmarks.get(keyframe.landmark_ids[seen]).descriptors).sum(axis=1) > 0.99
+        assert agree.mean() > 0.98
+
+
+def test_work_a_frame_does_not_grow_with_the_map(walk: Pair) -> None:
+    """What a frame projects is the local map; what an update restates is the local neighbourhood."""
+    landmarks = len(walk.mapper.map(0).landmarks)
+    local = walk.mapper.map(0).local_keyframes(max(walk.mapper.map(0).keyframes), CONFIG.tracking.local_keyframes)
+    assert len(local) <= CONFIG.tracking.local_keyframes
+    assert landmarks < 900
+    assert max(len(u.keyframes) for u in walk.updates[1:]) <= CONFIG.bundle.local_keyframes + CONFIG.bundle.fixed_keyframes + 30
+
+
+def test_wrong_matches_do_not_harm() -> None:
+    pair = Pair(matcher=FakeMatcher(wrong=0.3))
+    path = sideways(40, 0.05)
+    pair.run(cloud(count=600, seed=2, low=(-4, -3, 3), high=(8, 3, 8)), path)
+    error, tracked = position_error(pair.outputs, path)
+    assert error < 0.01 and tracked >= 32
+
+
+def test_a_loop_is_tracked() -> None:
+    pair, path = Pair(), loop(90)
+    pair.run(room(), path)
+    error, tracked = position_error(pair.outputs, path)
+    assert error < 0.01 and tracked >= 80
+
+
+def test_without_keypoints_tracking_is_lost_and_comes_back() -> None:
+    pair = Pair()
+    world, path = cloud(count=500, seed=3), sideways(30, 0.05)
+    pair.run(world, path[:20])
+    for index in (20, 21, 22):
+        output = pair.see(no_features(stamp(index)))
+        assert output.result.state is TrackingState.LOST and output.result.world_from_camera is None and output.result.reason
+    pair.run(world, path[23:], begin=23)
+    assert [o.result.state for o in pair.outputs[23:]] == [TrackingState.TRACKING] * 7
+    assert (pair.tracking.losses, pair.tracking.relocalizations) == (1, 1)
+    assert pair.tracking.map_id == 0
+
+
+def test_a_single_frame_without_keypoints_is_survived() -> None:
+    pair = Pair()
+    world, path = cloud(count=500, seed=3), sideways(26, 0.05)
+    pair.run(world, path[:20])
+    pair.see(no_features(stamp(20)))
+    pair.run(world, path[21:], begin=21)
+    assert [o.result.state for o in pair.outputs[21:]] == [TrackingState.TRACKING] * 5
+
+
+def test_a_camera_that_stays_elsewhere_begins_a_new_map_beside_the_old() -> None:
+    pair = Pair()
+    pair.run(cloud(count=500, seed=4), sideways(20, 0.05))
+    pair.run(cloud(count=500, seed=5), sideways(40, 0.05), begin=20)
+    states = [o.result.state for o in pair.outputs]
+    assert TrackingState.LOST in states[20:26] and states[-10:] == [TrackingState.TRACKING] * 10
+    assert pair.mapper.map_ids == [0, 1]
+    assert pair.tracking.map_id == 1
+    ids = [i for m in (0, 1) for i in pair.mapper.map(m).keyframes]
+    assert len(ids) == len(set(ids)), "keyframe ids are unique over all maps"
+    assert position_error(pair.outputs[:20], sideways(20, 0.05))[0] < 0.01
+    second = [o for o in pair.outputs[20:] if o.result.map_id == 1]
+    assert {o.result.map_id for o in pair.outputs[40:]} == {1} and len(second) > 25
+
+
+def test_hold_predicts_with_constant_velocity_and_changes_nothing() -> None:
+    pair = Pair()
+    assert pair.tracking.hold(stamp(0), "closed").result.world_from_camera is None
+    world, path = cloud(count=500, seed=6), sideways(40, 0.05)
+    pair.run(world, path[:20])
+    last, before = pair.outputs[-1].result.world_from_camera, pair.outputs[-2].result.world_from_camera
+    assert last is not None and before is not None
+    held = [pair.tracking.hold(stamp(i), "closed").result for i in range(20, 26)]
+    assert {r.state for r in held} == {TrackingState.HOLD}
+    step = np.linalg.norm(last[:3, 3] - before[:3, 3])
+    moved = np.linalg.norm(held[2].world_from_camera[:3, 3] - last[:3, 3])
+    assert moved == pytest.approx(3 * step, rel=0.5)
+    pair.run(world, path[26:], begin=26)
+    assert {o.result.state for o in pair.outputs[20:]} == {TrackingState.TRACKING}
+
+
+def test_frames_without_a_pose_are_placed_afterwards() -> None:
+    pair = Pair()
+    path = sideways(30, 0.02)
+    world = cloud(count=500, seed=7)
+    pair.run(world, path)
+    waited = {o.result.stamp_ns for o in pair.outputs if o.result.state is TrackingState.INITIALIZING}
+    keyframes = pair.mapper.map(0).keyframes
+    placed = pair.tracking.localize_afterwards()
+    covered = {p.stamp_ns for p in placed} | {k.stamp_ns for k in keyframes.values()}
+    assert len(waited) > 2 and waited <= covered
+    assert not {p.stamp_ns for p in placed} & {k.stamp_ns for k in keyframes.values()}
+    true = {stamp(i): p for i, p in enumerate(path)}
+    for p in placed:
+        reference = keyframes[p.reference_id]
+        expected = poses.inverse(true[reference.stamp_ns]) @ true[p.stamp_ns]
+        assert np.degrees(poses.rotation_angle(p.reference_from_camera[:3, :3].T @ expected[:3, :3])) < 0.5
+
+
+def test_repetition_gives_the_same_bytes() -> None:
+    pairs = [Pair(matcher=FakeMatcher(wrong=0.1)) for _ in range(2)]
+    for pair in pairs:
+        pair.run(cloud(count=500, seed=8), sideways(25, 0.05))
+    a, b = ([o.result.world_from_camera for o in pair.outputs] for pair in pairs)
+    assert [None if p is None else p.tobytes() for p in a] == [None if p is None else p.tobytes() for p in b]
+
+
+# ---- motion model --------------------------------------------------------------------------------------------------------------------
+
+
+def test_motion_model_by_hand() -> None:
+    model = MotionModel()
+    assert model.predict(5) is None and model.twist() is None
+    first = poses.transform(np.eye(3), [1.0, 0, 0])
+    model.update(1_000_000_000, first)
+    np.testing.assert_array_equal(model.predict(2_000_000_000), first)
+    turn = poses.transform(poses.so3_exp([0, 0, 0.2]), [0.5, 0, 0])
+    model.update(1_500_000_000, first @ turn)
+    predicted = model.predict(2_000_000_000)
+    np.testing.assert_allclose(predicted[:3, :3], poses.so3_exp([0, 0, 0.4]), atol=1e-12)
+    np.testing.assert_allclose(predicted[:3, 3], [2.0, 0, 0])
+    np.testing.assert_allclose(model.twist(), [0, 0, 0.4, 1.0, 0, 0], atol=1e-12)
+    model.move(poses.transform(np.eye(3), [0, 10.0, 0]))
+    np.testing.assert_allclose(model.predict(1_500_000_000)[:3, 3], [1.5, 10, 0], atol=1e-12)
+    np.testing.assert_allclose(model.twist(), [0, 0, 0.4, 1.0, 0, 0], atol=1e-12)
+    model.reset()
+    assert model.predict(5) is None
