@@ -168,7 +168,7 @@ class Editing(RuleBasedStateMachine):
                 where = self.editor.observers[landmark]
                 np.testing.assert_array_equal(row.descriptors[0], observers[newest].descriptors[where[newest]])
                 assert row.scores[0] == pytest.approx(np.mean([f.scores[where[i]] for i, f in observers.items()]), rel=1e-5)
-                assert 0 < row.depth_min[0] <= row.depth_max[0] < np.inf
+                assert 0 <= row.depth_min[0] <= row.depth_max[0] < np.inf
 
     @invariant()
     def both_directions_agree(self) -> None:
