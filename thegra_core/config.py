@@ -122,6 +122,7 @@ class ExtractorConfig(Section):
     max_keypoints: int = Field(1024, ge=32, le=8192, description="keypoints a frame at the most, the strongest")
     detection_threshold: float = Field(0.0, ge=0, description="least score; 0: the strongest max_keypoints, whatever their score (measured: SuperPoint's own 0.0005 finds too few on thermal frames)")
     nms_radius: int | None = Field(None, ge=1, le=32, description="px; none: what the network was published with (superpoint 4, aliked 2, xfeat 2); sift and orb have their own")
+    crowding: float = Field(1.0, ge=0, description="most keypoints of an image cell over its even share, as long as other cells have any; 0: the strongest wherever they are, as in the paper (measured)")
     border: int = Field(4, ge=0, le=64, description="px at the image's edge without keypoints")
     subpixel: bool = Field(True, description="superpoint: move keypoints from the whole pixel to the centre of mass of the 3x3 scores; measured: median epipolar error 9, 5 and 1 % less on three sequences; the paper's network gives whole pixels")
     long_side: int | None = Field(None, ge=128, description="px; images are scaled so that the long side has this length before detection; none: as they are")
@@ -145,8 +146,9 @@ class MatcherConfig(Section):
 class InitializationConfig(Section):
     """First map: reference frame, models, and what a map must show before it is claimed."""
 
-    min_matches: int = Field(50, ge=8, description="fewer matches than this over a gap longer than max_gap_frames advance the reference frame")
-    max_gap_frames: int = Field(30, ge=1, description="frames")
+    min_matches: int = Field(50, ge=8, description="matches to the reference frame that a start needs; thermal frames give fewer points than visible ones; ORB-SLAM3: 100")
+    max_starved_frames: int = Field(2, ge=0, description="frames in a row with fewer matches after which the reference frame advances")
+    max_gap_frames: int = Field(30, ge=2, description="frames after which the reference advances in any case")
     min_points: int = Field(50, ge=8, description="triangulated points of a map; ORB-SLAM3: 50")
     min_parallax_deg: float = Field(1.0, gt=0, description="degrees, median over the map's points; ORB-SLAM3: 1")
     max_reprojection_px: float = Field(2.0, gt=0, description="px; ORB-SLAM3: 2 (4 sigma^2)")
@@ -185,9 +187,9 @@ class MappingConfig(Section):
     """Growing and cleaning the map."""
 
     covisibility_threshold: int = Field(15, ge=1, description="shared landmarks that make an edge; ORB-SLAM3: 15")
-    neighbours: int = Field(4, ge=1, le=30, description="covisible keyframes that a new keyframe is matched to; ORB-SLAM3: 30, with learned matching each costs a network run")
+    neighbours: int = Field(3, ge=1, le=30, description="covisible keyframes that a new keyframe is matched to; ORB-SLAM3: 30, with learned matching each costs a network run")
     propagate_to: int = Field(10, ge=0, description="covisible keyframes in which new landmarks are looked for by projection")
-    min_baseline_ratio: float = Field(0.01, ge=0, description="distance to a neighbour over median depth below which nothing is triangulated with it; ORB-SLAM3: 0.01")
+    good_baseline_ratio: float = Field(0.1, ge=0, description="distance to a neighbour over median depth from which its baseline counts in full when neighbours are chosen")
     epipolar_px: float = Field(2.0, gt=0, description="px to the epipolar line; chi-square 3.84 at 1 px is 1.96 px")
     min_parallax_deg: float = Field(1.0, gt=0, description="degrees between the rays of a new point; ORB-SLAM3: 1.15")
     max_reprojection_px: float = Field(2.0, gt=0, description="px")

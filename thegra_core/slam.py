@@ -24,6 +24,8 @@ from thegra_core.snapshots import SnapshotKeeper
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
 
 FloatArray = NDArray[np.float64]
+BACKWARD_FRAMES = 3
+"""Backward stamps in a row that are refused before time is believed to have been set back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,7 @@ class Slam:
         self._mapper = Mapper(camera, config, self._matcher)
         self._frames: list[_Placed] = []
         self._last_stamp_ns: int | None = None
+        self._backward, self._backward_ns = 0, None  # type: int, int | None
         self._bad: Counter[str] = Counter()
         self._closures: list[tuple[int, int]] = []
         self._snapshots = SnapshotKeeper()
@@ -78,7 +81,7 @@ class Slam:
             state = TrackingState.INITIALIZING if self._tracking.map_id < 0 else TrackingState.LOST
             output = TrackingOutput(TrackingResult(frame.stamp_ns, state, reason=trouble))
         else:
-            self._last_stamp_ns = frame.stamp_ns
+            self._last_stamp_ns, self._backward = frame.stamp_ns, 0
             with self._timed("shutter"):
                 shutter = self._shutter.update(frame)
             self._note_closure(shutter)
@@ -160,12 +163,20 @@ class Slam:
             return "image holds NaN or infinity"
         if self._last_stamp_ns is not None and frame.stamp_ns == self._last_stamp_ns:
             return "stamp repeats"
-        if self._last_stamp_ns is not None and frame.stamp_ns < self._last_stamp_ns:
+        if self._last_stamp_ns is not None and frame.stamp_ns < self._last_stamp_ns and not self._new_epoch(frame.stamp_ns):
             return "stamp goes backwards"
         return ""
 
+    def _new_epoch(self, stamp_ns: int) -> bool:
+        """Whether enough backward stamps in a row ascend among themselves: then the clock was set, or one stamp was wrong, and time goes on from here."""
+        self._backward = self._backward + 1 if self._backward_ns is not None and stamp_ns > self._backward_ns else 1
+        self._backward_ns = stamp_ns
+        return self._backward > BACKWARD_FRAMES
+
     def _note_closure(self, shutter: ShutterState) -> None:
-        if shutter.shutter is Shutter.CLOSED:
+        if shutter.shutter is Shutter.JUST_OPENED and self._frames and self._frames[-1].result.state is not TrackingState.HOLD:
+            self._closures.append((self._frames[-1].result.stamp_ns, shutter.stamp_ns))  # frames are missing instead of repeated
+        elif shutter.shutter is Shutter.CLOSED:
             if self._closures and self._frames and self._frames[-1].result.state is TrackingState.HOLD:
                 self._closures[-1] = (self._closures[-1][0], shutter.stamp_ns)
             else:

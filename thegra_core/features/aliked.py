@@ -11,10 +11,13 @@ from thegra_core.config import ExtractorConfig
 from thegra_core.features.aliked_sparse import SparseAliked
 from thegra_core.features.assemble import assemble, scaled_image
 from thegra_core.features.checkpoint import load_checkpoint, load_exactly
+from thegra_core.features.detection import spread
 from thegra_core.features.device import resolve_device
 from thegra_core.messages import Features
 
 NMS_RADIUS = 2
+CANDIDATES = 4
+"""Times the keypoints kept that are detected, so that the border and the choice by place leave enough."""
 CHECKPOINTS = {"aliked": "aliked-n16", "aliked-n16rot": "aliked-n16rot"}
 
 
@@ -28,7 +31,7 @@ class Aliked:
         checkpoint = CHECKPOINTS[config.name]
         # kornia's top-k mode is chosen by a threshold that is not positive; more are asked for than are kept because some lie in the border
         threshold = config.detection_threshold if config.detection_threshold > 0 else -1.0
-        network = ALIKED(checkpoint, 2 * config.max_keypoints, threshold, config.nms_radius or NMS_RADIUS)
+        network = ALIKED(checkpoint, CANDIDATES * config.max_keypoints, threshold, config.nms_radius or NMS_RADIUS)
         load_exactly(network, load_checkpoint(checkpoint), checkpoint, missing=("dkd.hw_grid",))
         self._network = SparseAliked(network.eval().to(self._device))
 
@@ -45,7 +48,8 @@ class Aliked:
         border = config.border * min(scale)
         inside = ((pixels >= border) & (pixels <= size - border)).all(dim=1) & (values > config.detection_threshold)
         chosen = inside.nonzero()[:, 0]
-        chosen = chosen[torch.argsort(values[chosen], descending=True, stable=True)][: config.max_keypoints]
+        best = spread(pixels[chosen].cpu().numpy(), values[chosen].cpu().numpy(), config.max_keypoints, (scaled.shape[1], scaled.shape[0]), config.crowding)
+        chosen = chosen[torch.from_numpy(best).to(chosen.device)]
         keypoints, scores = pixels[chosen], values[chosen]
         descriptors = self._network.describe(levels, keypoints)
         return assemble(

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from thegra_core.config import ExtractorConfig
 from thegra_core.errors import InputError
+from thegra_core.features.detection import spread
 from thegra_core.messages import Features
 
 MIN_SCORE = np.float32(1e-6)
@@ -58,7 +59,7 @@ def assemble(
     if descriptors.dtype == np.float32:
         keep &= np.isfinite(descriptors).all(axis=1)
     chosen = np.flatnonzero(keep)
-    chosen = chosen[np.argsort(-scores[chosen], kind="stable")][: config.max_keypoints]
+    chosen = chosen[spread(raw[chosen], scores[chosen], config.max_keypoints, image_size, config.crowding)]
     return Features(
         stamp_ns=stamp_ns,
         keypoints=np.ascontiguousarray(raw[chosen], np.float32),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -46,3 +48,27 @@ def centroids(scores: Scores, keypoints: NDArray[np.int64]) -> Scores:
     total = masses.sum(axis=(1, 2))
     shift = np.stack(((masses * step).sum(axis=(1, 2)), (masses * step[:, None]).sum(axis=(1, 2))), axis=1) / total[:, None]
     return np.asarray(keypoints + shift, np.float32)
+
+
+def spread(keypoints: NDArray[np.floating[Any]] | NDArray[np.int64], scores: Scores, count: int, size: tuple[int, int], crowding: float) -> NDArray[np.int64]:
+    """Indices of at most `count` of the keypoints (N, 2), highest scores (N,) first, chosen so that they do not crowd.
+
+    The image of `size` (width, height) is divided into about `count` / 4 square cells; first each cell gives its strongest up to `crowding` times its even
+    share, then what is missing is filled by score alone. A pose from points on one bright object is badly determined; thermal images have few of them,
+    with all the contrast. crowding <= 0 chooses by score alone.
+    """
+    order = np.argsort(-scores, kind="stable")
+    if crowding <= 0 or len(order) <= count:
+        return order[:count]
+    cell = np.sqrt(4.0 * size[0] * size[1] / count)
+    columns, rows = int(np.ceil(size[0] / cell)), int(np.ceil(size[1] / cell))
+    places = np.floor(keypoints[order] / cell).astype(np.int64)
+    cells = np.clip(places[:, 1], 0, rows - 1) * columns + np.clip(places[:, 0], 0, columns - 1)
+    by_cell = np.argsort(cells, kind="stable")  # within a cell still strongest first
+    starts = np.flatnonzero(np.diff(cells[by_cell], prepend=-1))
+    rank = np.empty(len(order), np.int64)
+    rank[by_cell] = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
+    within = rank < max(1, round(crowding * count / (columns * rows)))
+    first = np.flatnonzero(within)[:count]
+    rest = np.flatnonzero(~within)[: count - len(first)]
+    return order[np.sort(np.concatenate((first, rest)))]

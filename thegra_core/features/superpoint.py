@@ -15,13 +15,14 @@ from torch.nn import functional
 from thegra_core.config import ExtractorConfig
 from thegra_core.features.assemble import assemble, scaled_image
 from thegra_core.features.checkpoint import load_checkpoint, load_exactly
-from thegra_core.features.detection import centroids, strongest, suppress
+from thegra_core.features.detection import centroids, spread, strongest, suppress
 from thegra_core.features.device import resolve_device
 from thegra_core.messages import Features
 
 CELL = 8
 """Pixels a side of the detector's cells: three max-poolings of two."""
 NMS_RADIUS = 4
+CANDIDATES = 4
 
 
 class SuperPoint:
@@ -45,7 +46,10 @@ class SuperPoint:
         score_map, descriptor_map = self._network(grey)
         scores = score_map[0].cpu().numpy()
         border = max(1, round(config.border * min(scale)))
-        pixels, values = strongest(suppress(scores, config.nms_radius or NMS_RADIUS), config.max_keypoints, config.detection_threshold, border)
+        peaks = suppress(scores, config.nms_radius or NMS_RADIUS)
+        pixels, values = strongest(peaks, CANDIDATES * config.max_keypoints, config.detection_threshold, border)
+        chosen = spread(pixels, values, config.max_keypoints, (scaled.shape[1], scaled.shape[0]), config.crowding)
+        pixels, values = pixels[chosen], values[chosen]
         descriptors = sample_descriptors(descriptor_map[0], torch.from_numpy(pixels).to(self._device, torch.float32))
         keypoints = centroids(scores, pixels) if config.subpixel else pixels.astype(np.float32)
         return assemble(config, stamp_ns, (image.shape[1], image.shape[0]), scale, keypoints, values, descriptors.cpu().numpy())

@@ -33,7 +33,7 @@ class XFeat:
         config = self._config
         scaled, scale = scaled_image(image, config.long_side)
         grey = torch.from_numpy(np.ascontiguousarray(scaled)).to(self._device).float()[None, None] / 255
-        found = self._pipeline.detectAndCompute(grey, top_k=2 * config.max_keypoints, detection_threshold=config.detection_threshold)[0]
+        found = self._pipeline.detectAndCompute(grey, top_k=4 * config.max_keypoints, detection_threshold=config.detection_threshold)[0]
         size = np.asarray([scaled.shape[1], scaled.shape[0]])
         seen = np.maximum(_MULTIPLE, size // _MULTIPLE * _MULTIPLE)
         # kornia scales pixel indices by the size ratio; pixel centres move by half the difference besides

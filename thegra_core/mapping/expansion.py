@@ -80,4 +80,5 @@ def _join(editor: MapEditor, seeing: MapKeyframe, other: MapKeyframe, seeing_ind
             if landmark in editor.observers:  # not fused away a moment ago
                 editor.observe(landmark, other.id, feature)
         elif present != landmark:
-            editor.fuse(min(present, landmark), max(present, landmark))
+            keep, drop = sorted((landmark, present), key=lambda i: (-len(editor.observers.get(i, ())), i))
+            editor.fuse(keep, drop)

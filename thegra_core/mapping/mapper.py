@@ -99,26 +99,31 @@ class Mapper:
         neighbours = self._choose_neighbours(editor, keyframe)
         features = keyframe.features
         known: dict[int, Matches] = {}
-        if keyframe.reference_matches is not None:
+        if keyframe.reference_matches is not None and keyframe.reference_id in editor.map.keyframes:
             known[keyframe.reference_id] = keyframe.reference_matches
         open_ids = [i for i in neighbours if i not in known]
         matched = self._matcher.match_many(features, [editor.map.keyframes[i].features for i in open_ids])
         known.update(zip(open_ids, matched, strict=True))
         before = editor.next_landmark
-        for neighbour in neighbours:
-            expand(editor, keyframe.id, neighbour, known[neighbour], self._config.mapping)
+        for neighbour, matches in known.items():
+            expand(editor, keyframe.id, neighbour, matches, self._config.mapping)
         created = np.arange(before, editor.next_landmark, dtype=np.int64)
         self._trial[keyframe.map_id].extend(created.tolist())
-        others = [i for i in editor.map.neighbours(keyframe.id, self._config.mapping.propagate_to) if i not in neighbours]
+        others = [i for i in editor.map.neighbours(keyframe.id, self._config.mapping.propagate_to) if i not in known]
         propagate(editor, created, others, self._config.tracking)
 
     def _choose_neighbours(self, editor: MapEditor, keyframe: Keyframe) -> list[int]:
-        """The reference and the best covisible keyframes, every one far enough away for its baseline to say something."""
-        candidates = editor.map.neighbours(keyframe.id, 3 * self._config.mapping.neighbours)
-        if keyframe.reference_id in editor.map.keyframes:
-            candidates = [keyframe.reference_id, *(i for i in candidates if i != keyframe.reference_id)]
+        """Covisible keyframes to match: those that share much and stand far enough apart for new points to have parallax.
+
+        A neighbour counts by the landmarks it shares, less in proportion the shorter its baseline is than `good_baseline_ratio` of the scene's depth: where
+        keyframes follow each other closely, the nearest share most and tell least.
+        """
+        settings = self._config.mapping
         depth = editor.map.median_depth(keyframe.id)
         center = editor.map.keyframes[keyframe.id].center
-        least = self._config.mapping.min_baseline_ratio * depth if np.isfinite(depth) else 0.0
-        far = [i for i in candidates if np.linalg.norm(editor.map.keyframes[i].center - center) >= least]
-        return far[: self._config.mapping.neighbours]
+        good = settings.good_baseline_ratio * depth if np.isfinite(depth) else 0.0
+        worth = []
+        for other, shared in editor.map.covisibility.get(keyframe.id, ()):
+            baseline = float(np.linalg.norm(editor.map.keyframes[other].center - center))
+            worth.append((shared * min(1.0, baseline / good) if good > 0 else float(shared), other))
+        return [other for _, other in sorted(worth, reverse=True)[: settings.neighbours]]

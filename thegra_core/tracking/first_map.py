@@ -112,17 +112,23 @@ def _problem(table: TrackTable, camera_from_world: FloatArray, points: FloatArra
 def _judge(
     table: TrackTable, problem: BundleProblem, world_from_camera: FloatArray, points: FloatArray, model: str, config: ThegraConfig
 ) -> FirstMap:
-    chi2 = config.bundle.chi2_px2
-    # a point the start left out may fit the adjusted poses: cost and map look at all matches again
-    camera_from_world = np.stack([poses.inverse(pose) for pose in world_from_camera])
-    points = triangulation.triangulate_views(camera_from_world, np.swapaxes(table.normalized, 0, 1))
-    points = np.where(np.isfinite(points), points, -1.0)
-    errors = np.full(table.normalized.shape[:2], np.inf)
-    errors[problem.keyframe_index, problem.point_index] = squared_errors(problem, world_from_camera, points)
+    chi2, limit = config.bundle.chi2_px2, config.initialization.max_reprojection_px**2
     seen = np.isfinite(table.normalized).all(axis=2)
+
+    def errors_of(points_world: FloatArray) -> FloatArray:
+        errors = np.full(seen.shape, np.inf)
+        errors[problem.keyframe_index, problem.point_index] = squared_errors(problem, world_from_camera, points_world)
+        return errors
+
+    # a point the start left out may fit the adjusted poses: place it anew, by the two views whose match is the claim; one wrong match between must not move it
+    errors = errors_of(points)
+    first, last = poses.inverse(world_from_camera[0]), poses.inverse(world_from_camera[-1])
+    again = triangulation.triangulate(first, last, table.normalized[0], table.normalized[-1])
+    adjusted = (errors[0] < limit) & (errors[-1] < limit)
+    points = np.where(adjusted[:, None], points, np.where(np.isfinite(again), again, -1.0))
+    errors = errors_of(points)
     used = errors < chi2
     parallax = np.degrees(triangulation.parallax(world_from_camera[0][:3, 3], world_from_camera[-1][:3, 3], points))
-    limit = config.initialization.max_reprojection_px**2
     good = (errors[0] < limit) & (errors[-1] < limit) & (parallax > MIN_POINT_PARALLAX_DEG)
     return FirstMap(
         world_from_camera=world_from_camera,

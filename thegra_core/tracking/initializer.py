@@ -39,6 +39,7 @@ class Initializer:
         self._matcher = matcher
         self._rng = np.random.default_rng(config.seed)
         self._frames: list[_Candidate] = []  # the first is the reference
+        self._starved = 0
 
     @property
     def reference_features(self) -> Features | None:
@@ -47,6 +48,7 @@ class Initializer:
     def reset(self) -> None:
         """Forget all frames, for example after a shutter closure that changed the image."""
         self._frames = []
+        self._starved = 0
 
     def add(self, features: Features, matches: Matches | None, map_id: int, next_keyframe_id: int) -> InitialMap | str:
         """The next frame, with its matches to `reference_features` if there are any already; a first map, or why there is none yet."""
@@ -65,13 +67,19 @@ class Initializer:
         return solved if isinstance(solved, str) else self._as_map(solved[0], solved[1], matches, map_id, next_keyframe_id)
 
     def _advance_reference(self, matches: Matches) -> Matches:
-        """Paper: too few correspondences over too long a gap advance the reference frame, half the gap at a time."""
+        """Paper: too few correspondences over too long a gap advance the reference frame, half the gap at a time.
+
+        A single frame without matches (blur, a hand before the lens) moves nothing.
+        """
         settings = self._config.initialization
-        while len(self._frames) > 2 and (len(matches) < settings.min_matches or len(self._frames) > settings.max_gap_frames):
+        self._starved = self._starved + 1 if len(matches) < settings.min_matches else 0
+        while len(self._frames) > 2 and (self._starved > settings.max_starved_frames or len(self._frames) > settings.max_gap_frames):
             self._frames = self._frames[max(1, (len(self._frames) - 1) // 2) :]
             for candidate in self._frames:
                 candidate.to_reference = None
             matches = self._matcher.match(self._frames[-1].features, self._frames[0].features)
+            if len(matches) >= settings.min_matches:
+                self._starved = 0
         return matches
 
     def _attempt(self, matches: Matches) -> tuple[FirstMap, list[_Candidate]] | str:
