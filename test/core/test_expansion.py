@@ -138,14 +138,14 @@ def test_a_landmark_that_does_not_reproject_is_not_joined_and_its_match_makes_no
     assert editor.map.keyframes[1].landmark_ids[2] == NO_LANDMARK
 
 
-def test_two_landmarks_of_one_point_are_fused_into_the_older(editor: MapEditor) -> None:
-    older, younger = known(editor, 1, [0]), known(editor, 1, [1, 2])
-    editor.visible[younger], editor.found[younger] = 9, 4
+def test_two_landmarks_of_one_point_are_fused_into_the_better_observed(editor: MapEditor) -> None:
+    dropped, kept = known(editor, 1, [0]), known(editor, 1, [1, 2])
+    editor.visible[kept], editor.found[kept] = 9, 4
     assert expand(editor, 1, 0, ALL, CONFIG) == 3
-    assert younger not in editor.observers
-    assert editor.observers[older] == {0: 1, 1: 1, 2: 1}
-    assert (editor.visible[older], editor.found[older]) == (10, 5)
-    assert editor.map.keyframes[2].landmark_ids[1] == older
+    assert dropped not in editor.observers
+    assert editor.observers[kept] == {0: 1, 1: 1, 2: 1}
+    assert (editor.visible[kept], editor.found[kept]) == (10, 5)
+    assert editor.map.keyframes[2].landmark_ids[1] == kept
 
 
 def test_what_two_landmarks_of_one_ray_become_explains_its_observations(editor: MapEditor) -> None:

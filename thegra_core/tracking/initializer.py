@@ -19,6 +19,10 @@ from thegra_core.tracking.hypotheses import motion_hypotheses, parallax_to_noise
 FloatArray = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
+SMALL_SAMPLE = 5.0
+"""Margin over the square root of the number of matches on the parallax-to-noise limit: the standard error of a ratio of two medians is about 1.7 over
+that root, and three of them cover the best of several hypotheses and frames."""
+
 @dataclass(slots=True)
 class _Candidate:
     features: Features
@@ -92,8 +96,9 @@ class Initializer:
             return f"{len(x0)} matches inside the camera model's field, {settings.min_matches} needed: check the calibration"
         hypotheses = motion_hypotheses(x0, x1, self._camera.focal, settings, self._rng)
         flow, ratio = parallax_to_noise(x0, x1, self._camera.focal, hypotheses)
-        if ratio < settings.min_parallax_to_noise:
-            return f"no parallax: a pure rotation explains the matches to {flow:.1f} px, {ratio:.1f} times their noise, {settings.min_parallax_to_noise:g} needed: move sideways"
+        needed = settings.min_parallax_to_noise * (1.0 + SMALL_SAMPLE / np.sqrt(len(x0)))
+        if ratio < needed:
+            return f"no parallax: a pure rotation explains the matches to {flow:.1f} px, {ratio:.1f} times their noise, {needed:.1f} needed: move sideways"
         views = [reference, *self._between(), current]
         table = self._tabulate(views, matches)
         solved = [m for h in hypotheses if (m := solve_first_map(table, h.camera1_from_camera0, h.model, self._config)) is not None]
