@@ -73,6 +73,7 @@ def run(
     duration: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="Seconds of the recording to process.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of every random choice. Default: the configuration's, 0.")] = None,
     viewer: Annotated[str, typer.Option(help="none, or rerun to watch live.")] = "none",
+    cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there: runs that differ only in seed or back end are then much faster.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors and one final line only.")] = False,
 ) -> None:
     """Estimate the camera's trajectory and a map from a recording.
@@ -85,7 +86,7 @@ def run(
 
     options = RunOptions(
         recording=recording, topic=topic, camera=camera, profile=profile, config=config, assignments=tuple(set_ or ()), out=out,
-        groundtruth=groundtruth, max_frames=max_frames, start_s=start, duration_s=duration, seed=seed, viewer=viewer, quiet=quiet,
+        groundtruth=groundtruth, max_frames=max_frames, start_s=start, duration_s=duration, seed=seed, viewer=viewer, quiet=quiet, cache=cache,
     )  # fmt: skip
     raise typer.Exit(run_recording(options))
 

@@ -8,12 +8,12 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from thegra_core.cli import exit_codes
 from thegra_core.cli.progress import News, Progress, headline, make_progress, print_summary
@@ -28,6 +28,10 @@ from thegra_core.outputs.write import RecordingFacts, write_run
 from thegra_core.sources.open import camera_for, open_recording
 from thegra_core.sources.recording import Recording
 from thegra_core.version import VERSION
+
+if TYPE_CHECKING:
+    from thegra_core.features.cache import CachedExtractor, CachedMatcher
+    from thegra_core.features.protocols import Extractor, Matcher
 
 _log = logging.getLogger(__name__)
 
@@ -50,6 +54,7 @@ class RunOptions:
     seed: int | None = None
     viewer: str = "none"
     quiet: bool = False
+    cache: Path | None = None
 
 
 class System(Protocol):
@@ -91,7 +96,8 @@ def run_recording(options: RunOptions) -> int:
     with _log_file(out), make_progress(options.quiet, _expected_frames(options, recording)) as progress, _interrupts() as interrupted:
         for line in (f"thegra {VERSION}, profile {config.profile}, seed {config.seed}", f"input {recording.path}", f"arguments {shlex.join(sys.argv[1:])}", *recording.notes):
             _log.info("%s", line)
-        system = make_system(camera, config)
+        front_end = _cached_front_end(config, options.cache)
+        system = make_system(camera, config, *front_end)
         done, wall_s = _process(system, _window(recording, options), recording, progress, viewer, interrupted)
         if done.frames == 0 and done.interrupted:
             raise KeyboardInterrupt
@@ -99,7 +105,7 @@ def run_recording(options: RunOptions) -> int:
             raise done.error or InputError(_no_frames(options, done))
         begin = time.perf_counter()
         run = system.finish(progress.stage)
-        timing = Timing(wall_s=wall_s, frames_read=done.frames, finish_s=time.perf_counter() - begin)
+        timing = Timing(wall_s=wall_s, frames_read=done.frames, finish_s=time.perf_counter() - begin, cached_pct=_cached_pct(front_end))
         viewer.finish(run)
         facts = RecordingFacts(
             name=recording.name, path=recording.path, topic=recording.topic, camera=camera, weights=_weights(config), problems=done.unreadable,
@@ -117,11 +123,24 @@ def run_recording(options: RunOptions) -> int:
     return exit_codes.DONE if written.metrics["frames_tracked"] else exit_codes.NOTHING_TRACKED
 
 
-def make_system(camera: CameraModel, config: ThegraConfig) -> System:
+def make_system(camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None) -> System:
     """The SLAM system; imported here because the networks take seconds to load."""
     from thegra_core.slam import Slam
 
-    return Slam(camera, config)
+    return Slam(camera, config, extractor, matcher)
+
+
+def _cached_front_end(config: ThegraConfig, folder: Path | None) -> tuple[()] | tuple[CachedExtractor, CachedMatcher]:
+    if folder is None:
+        return ()
+    from thegra_core.features.cache import cached_extractor, cached_matcher
+
+    return cached_extractor(config.extractor, folder), cached_matcher(config.matcher, config.extractor, folder)
+
+
+def _cached_pct(front_end: Sequence[CachedExtractor | CachedMatcher]) -> float | None:
+    hits, misses = (sum(getattr(part.store, name) for part in front_end) for name in ("hits", "misses"))
+    return round(100 * hits / (hits + misses), 2) if hits + misses else None
 
 
 def _process(

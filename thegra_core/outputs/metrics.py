@@ -28,12 +28,14 @@ class Timing:
     """What the run cost.
 
     wall_s covers all frames, without the work after the last one (`finish_s`); frames_read counts the frames that were handed to the system.
+    cached_pct is the share of the networks' results that came from a cache, None without one.
     """
 
     wall_s: float
     frames_read: int
     finish_s: float = 0.0
     dropped_frames: int = 0
+    cached_pct: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +132,7 @@ def _time_metrics(run: Run, timing: Timing) -> dict[str, Any]:
         "wall_s": round(timing.wall_s, 3),
         "finish_s": round(timing.finish_s, 3),
         "dropped_frames": timing.dropped_frames,
+        "cached_pct": timing.cached_pct,
         "peak_rss_mb": round(peak_rss_mb(), 1),
     }
 
