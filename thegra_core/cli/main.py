@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from thegra_core.cli import exit_codes
+from thegra_core.cli.benchmark import app as benchmark_app
 from thegra_core.cli.weights import app as weights_app
 from thegra_core.errors import ThegraError
 from thegra_core.version import VERSION
@@ -150,6 +151,7 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
 
 
 app.add_typer(weights_app, name="weights")
+app.add_typer(benchmark_app, name="benchmark")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,111 @@
+"""`thegra benchmark`: measure the system over recordings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from thegra_core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from thegra_core.evaluation.benchmark.slam import PlannedRun, RunResult
+
+app = typer.Typer(no_args_is_help=True, help="Measure the system over recordings.")
+SOME_FAILED = 1
+
+
+@app.callback()
+def benchmark() -> None:
+    """Measure the system over recordings."""
+
+
+@app.command("slam")
+def slam(
+    recordings: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Recordings as `thegra run` takes them, with groundtruth.txt and shutter.txt beside the images if there are.")],
+    profile: Annotated[list[str] | None, typer.Option(help="paper, quality or fast; repeatable. Default: quality.")] = None,
+    runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
+    cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there; their time is then missing from s/frame.")] = None,
+    max_frames: Annotated[list[str] | None, typer.Option("--max-frames", metavar="NAME=N", help="Use the first N frames of the recording of that name; repeatable.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the tables and every run's results. Default: runs/benchmark_TIME.")] = None,
+    peers: Annotated[Path | None, typer.Option(metavar="FILE", help='Results of other systems, JSON {sequence: {peer: {variant: {"tracked_pct": [...], "ate_rmse": [...]}}}}.')] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter for all runs; repeatable. `thegra config` lists them.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print results.json instead of the table.")] = False,
+) -> None:
+    """Run recordings with profiles and seeds, each in a process of its own, and tell coverage, error, time and memory.
+
+    Example: `thegra benchmark slam recordings/* --profile quality --profile fast --runs 3 --out runs/benchmark`
+
+    Writes results.json and results.md (a table for a README). Exit code: 0 all ran, 1 some run failed, 2 wrong use.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from thegra_core.evaluation.benchmark import slam as logic
+    from thegra_core.evaluation.benchmark.peers import read_peers
+    from thegra_core.evaluation.benchmark.tables import markdown
+
+    plan = logic.Plan(
+        recordings=tuple(recordings),
+        out=out or Path("runs") / f"benchmark_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}",
+        profiles=tuple(dict.fromkeys(profile or ["quality"])),
+        runs=runs,
+        cache=cache,
+        max_frames=_limits(max_frames or []),
+        assignments=tuple(set_ or ()),
+    )
+    others = read_peers(peers) if peers is not None else None
+    total = len(logic.planned_runs(plan))
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("starting", total=total)
+
+        def before(run: PlannedRun) -> None:
+            bar.update(task, description=f"{run.name} {run.profile} seed {run.seed}")
+
+        def after(results: Sequence[RunResult]) -> None:
+            content = logic.report(plan, results, others)
+            logic.write_report(plan, content, markdown(content))
+            bar.advance(task)
+
+        results = logic.run_plan(plan, before, after)
+    _show(logic.report(plan, results, others), plan.out, as_json)
+    if any(result.error is not None for result in results):
+        raise typer.Exit(SOME_FAILED)
+
+
+def _limits(texts: list[str]) -> dict[str, int]:
+    limits: dict[str, int] = {}
+    for text in texts:
+        name, _, count = text.rpartition("=")
+        if not name or not count.isdecimal() or int(count) == 0:
+            raise ConfigError(f"--max-frames {text}: write NAME=N with the recording's name and a number of frames, e.g. --max-frames flight=100")
+        limits[name] = int(count)
+    return limits
+
+
+def _show(content: dict[str, object], out: Path, as_json: bool) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from thegra_core.evaluation.benchmark.tables import caption, failures, table
+
+    for failure in failures(content):
+        typer.echo(f"failed: {failure}", err=True)
+    if as_json:
+        print(json.dumps(content, indent=2, allow_nan=False))
+        return
+    header, rows = table(content)
+    shown = Table(caption=escape(caption(content)), caption_justify="left")
+    for name in header:
+        shown.add_column(name, overflow="fold")
+    for row in rows:
+        shown.add_row(*map(escape, row))
+    console = Console(highlight=False)
+    console.print(shown)
+    console.print(f"results  {out / 'results.json'}\ntable    {out / 'results.md'}", soft_wrap=True, markup=False)

@@ -1,0 +1,272 @@
+"""The whole system over many recordings: every recording with every profile and seed, each run in a process of its own, scored against ground truth.
+
+A run is the command `thegra run` itself, so that what is measured (memory, start, files) is what a user gets, and no run sees what another left behind.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thegra_core.config import load_config
+from thegra_core.errors import ConfigError, InputError
+from thegra_core.evaluation.benchmark.peers import best_peer, median_or_none
+from thegra_core.evaluation.scores import read_intervals, read_stamps
+from thegra_core.messages import FloatArray, IntArray
+from thegra_core.outputs.files import write_atomic
+from thegra_core.outputs.scoring import half_period, score_trajectory
+from thegra_core.outputs.trajectory import Trajectory, read_tum
+from thegra_core.sources.open import open_recording
+from thegra_core.version import VERSION
+
+_RAN = (0, 1)
+"""Exit codes of `thegra run` that come with results: done, nothing tracked."""
+_ERROR_CHARACTERS = 2000
+_FROM_METRICS = ("frames_total", "maps", "losses", "relocalizations", "keyframes", "landmarks", "finish_s", "cached_pct", "peak_rss_mb")
+_STILL = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What to run: every recording with every profile and the seeds 0 to runs - 1.
+
+    max_frames maps a recording's name (that of its folder or file) to the frames it is cut to. assignments are `key=value` parameters.
+    """
+
+    recordings: tuple[Path, ...]
+    out: Path
+    profiles: tuple[str, ...] = ("quality",)
+    runs: int = 1
+    cache: Path | None = None
+    max_frames: Mapping[str, int] = field(default_factory=dict)
+    assignments: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedRun:
+    """One run of the plan; its files go to `folder`."""
+
+    recording: Path
+    profile: str
+    seed: int
+    folder: Path
+    max_frames: int | None
+
+    @property
+    def name(self) -> str:
+        return recording_name(self.recording)
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """How a run ended; `figures` is empty and `error` says why where it failed."""
+
+    run: PlannedRun
+    exit_code: int
+    figures: Mapping[str, Any]
+    error: str | None = None
+
+
+def planned_runs(plan: Plan) -> list[PlannedRun]:
+    """All runs in order: recording, then profile, then seed.
+
+    Raises:
+        InputError: If a recording does not exist, or two have the same name, or `max_frames` names none.
+        ConfigError: If a profile or an assignment is not understood.
+    """
+    names = [recording_name(path) for path in plan.recordings]
+    for path in plan.recordings:
+        if not path.exists():
+            raise InputError(f"{path} does not exist; give folders or files that `thegra run` takes")
+    if len(set(names)) < len(names):
+        raise InputError(f"recordings need different names to tell their results apart, got {', '.join(sorted(names))}; run the command once for each")
+    unknown = sorted(set(plan.max_frames) - set(names))
+    if unknown:
+        raise InputError(f"--max-frames {unknown[0]}=...: no recording is called that; there are {', '.join(names)}")
+    for profile in plan.profiles:
+        load_config(profile, None, _overrides(plan.assignments))
+    return [
+        PlannedRun(path, profile, seed, plan.out / name / profile / f"seed{seed}", plan.max_frames.get(name))
+        for path, name in zip(plan.recordings, names, strict=True)
+        for profile in plan.profiles
+        for seed in range(plan.runs)
+    ]
+
+
+def run_plan(plan: Plan, before: Callable[[PlannedRun], None], after: Callable[[Sequence[RunResult]], None]) -> list[RunResult]:
+    """Run everything in order; `before` is told what starts, `after` all results so far each time one is there. A failed run stops nothing.
+
+    Raises:
+        ThegraError: As `planned_runs`, before anything runs.
+    """
+    results: list[RunResult] = []
+    for run in planned_runs(plan):
+        before(run)
+        results.append(execute(run, plan))
+        after(results)
+    return results
+
+
+def execute(run: PlannedRun, plan: Plan) -> RunResult:
+    """One run in a process of its own, scored."""
+    run.folder.mkdir(parents=True, exist_ok=True)
+    for stale in (*run.folder.glob("*.json"), *run.folder.glob("*.txt")):
+        stale.unlink()
+    child = subprocess.run(command(run, plan), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace", check=False)
+    said = child.stderr.strip()[-_ERROR_CHARACTERS:]
+    if child.returncode < 0:
+        said = f"{said}\nended by {signal.Signals(-child.returncode).name}".strip()
+    if child.returncode not in _RAN or not (run.folder / "metrics.json").is_file():
+        return RunResult(run, child.returncode, {}, said or f"exit code {child.returncode}")
+    try:
+        return RunResult(run, child.returncode, figures_of(run))
+    except InputError as error:
+        return RunResult(run, child.returncode, {}, str(error))
+
+
+def command(run: PlannedRun, plan: Plan) -> list[str]:
+    """The command line of a run."""
+    options = [run.recording, "--profile", run.profile, "--seed", run.seed, "--out", run.folder, "--quiet"]
+    options += ["--max-frames", run.max_frames] if run.max_frames is not None else []
+    options += ["--cache", plan.cache] if plan.cache is not None else []
+    options += [word for assignment in plan.assignments for word in ("--set", assignment)]
+    return [sys.executable, "-m", "thegra_core.cli.main", "run", *map(str, options)]
+
+
+# ---- figures of one run -----------------------------------------------------------------------------------------------------------
+
+
+def figures_of(run: PlannedRun) -> dict[str, Any]:
+    """Figures of a finished run from its files: what it says of itself, and its score.
+
+    `truth` is none, still (a reference that does not move tells no error) or moving; poses counts the poses claimed in all maps and extent
+    is the longest diagonal of the box around one map's poses, in map units (the median depth of the first map is 1).
+
+    Raises:
+        InputError: If the ground truth or another file beside the recording cannot be read.
+    """
+    metrics = json.loads((run.folder / "metrics.json").read_text(encoding="utf-8"))
+    trajectories = [read_tum(file) for file in sorted(run.folder.glob("trajectory*.txt")) if file.name != "trajectory_live.txt"]
+    ms = metrics["ms_per_frame"]
+    figures: dict[str, Any] = {key: metrics[key] for key in _FROM_METRICS}
+    figures |= {
+        "poses": sum(len(t) for t in trajectories),
+        "extent": max((_diagonal(t.positions) for t in trajectories), default=0.0),
+        "s_per_frame": {p: None if ms[p] is None else round(ms[p] / 1e3, 4) for p in ("p50", "p95")},
+    }
+    return figures | _scores(run, metrics)
+
+
+def _scores(run: PlannedRun, metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Coverage and errors; over the images of `images.txt` outside the closures of `shutter.txt` where these are, else as the run scored itself."""
+    files = {name: run.recording / f"{name}.txt" for name in ("images", "shutter")}
+    truth_file = open_recording(run.recording).groundtruth
+    none = {"truth": "none", "tracked_pct": metrics["tracked_pct"], "ate_rmse": None, "ate_rel": None, "in_closure": 0, "spread": None}
+    if not files["images"].is_file() or truth_file is None:
+        truth = read_tum(truth_file) if truth_file is not None else None
+        scored = {key: metrics.get(key) for key in ("ate_rmse", "ate_rel")}
+        return none | scored | ({"truth": _kind(truth), "spread": _spread(truth.positions)} if truth is not None else {})
+    stamps = read_stamps(files["images"])[: run.max_frames]
+    truth = _within(read_tum(truth_file), stamps)
+    closures = read_intervals(files["shutter"]) if files["shutter"].is_file() else ()
+    score = score_trajectory(read_tum(run.folder / "trajectory.txt"), truth, stamps, closures_ns=closures)
+    return {key: getattr(score, key) for key in ("tracked_pct", "ate_rmse", "ate_rel", "ate_pct", "rot_deg", "in_closure")} | {
+        "truth": _kind(truth),
+        "spread": _spread(truth.positions),
+    }
+
+
+def _within(trajectory: Trajectory, stamps_ns: IntArray) -> Trajectory:
+    if len(stamps_ns) == 0:
+        return trajectory
+    margin = half_period(stamps_ns)
+    inside = (trajectory.stamps_ns >= stamps_ns[0] - margin) & (trajectory.stamps_ns <= stamps_ns[-1] + margin)
+    return Trajectory(trajectory.stamps_ns[inside], trajectory.poses[inside])
+
+
+def _kind(truth: Trajectory) -> str:
+    return "moving" if len(truth) and _diagonal(truth.positions) > _STILL else "still"
+
+
+def _spread(positions: FloatArray) -> float:
+    """RMS distance of positions (N, 3) from their centroid: an aligned trajectory cannot have a larger ATE."""
+    return float(np.sqrt(np.mean(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1)))) if len(positions) else 0.0
+
+
+def _diagonal(positions: FloatArray) -> float:
+    return float(np.linalg.norm(np.ptp(positions, axis=0))) if len(positions) else 0.0
+
+
+# ---- results of all runs ----------------------------------------------------------------------------------------------------------
+
+
+def summarize(results: Sequence[RunResult]) -> dict[str, Any]:
+    """Figures of the runs of one recording with one profile: medians and every seed's value; None of a seed stands for the worst.
+
+    Time is that of the first run that did not fail; memory the most of any.
+    """
+    first = results[0].run
+    ran = [r.figures for r in results if r.figures]
+    summary: dict[str, Any] = {"recording": first.name, "profile": first.profile, "max_frames": first.max_frames, "seeds": [r.run.seed for r in results]}
+    summary["failed"] = [{"seed": r.run.seed, "exit_code": r.exit_code, "error": r.error} for r in results if r.error is not None]
+    for key in ("tracked_pct", "ate_rmse", "ate_rel"):
+        values = [r.figures.get(key) for r in results]
+        summary[key] = {"median": median_or_none([f[key] for f in ran], worst=0.0 if key == "tracked_pct" else np.inf), "seeds": values}
+    for key in ("maps", "losses", "poses", "extent", "in_closure"):
+        summary[key] = [r.figures.get(key) for r in results]
+    summary |= {key: ran[0][key] if ran else None for key in ("truth", "spread", "s_per_frame", "cached_pct")}
+    summary["peak_rss_mb"] = max((f["peak_rss_mb"] for f in ran), default=None)
+    summary["runs"] = [{"seed": r.run.seed, "folder": str(r.run.folder), "exit_code": r.exit_code} | dict(r.figures) for r in results]
+    return summary
+
+
+def report(plan: Plan, results: Sequence[RunResult], peers: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Everything `results.json` holds."""
+    groups: dict[tuple[str, str], list[RunResult]] = {}
+    for result in results:
+        groups.setdefault((result.run.name, result.run.profile), []).append(result)
+    return {
+        "version": VERSION,
+        "machine": {"platform": platform.platform(), "python": platform.python_version(), "processors": os.cpu_count()},
+        "runs": plan.runs,
+        "assignments": list(plan.assignments),
+        "results": [summarize(group) for group in groups.values()],
+        "peers": {name: best_peer(peers.get(name, {})) for name in dict.fromkeys(name for name, _ in groups)} if peers is not None else {},
+    }
+
+
+def write_report(plan: Plan, content: Mapping[str, Any], markdown: str) -> None:
+    """`results.json` and `results.md` into the plan's folder.
+
+    Raises:
+        InputError: If it cannot be written.
+    """
+    try:
+        plan.out.mkdir(parents=True, exist_ok=True)
+        write_atomic(plan.out / "results.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
+        write_atomic(plan.out / "results.md", markdown)
+    except OSError as error:
+        raise InputError(f"cannot write to {plan.out}: {error.strerror}; choose another folder with --out DIR") from error
+
+
+def recording_name(path: Path) -> str:
+    """Name of a recording in results and options: that of its folder or file."""
+    return path.resolve().name
+
+
+def _overrides(assignments: Sequence[str]) -> dict[str, Any]:
+    pairs = [assignment.partition("=") for assignment in assignments]
+    wrong = next((assignment for assignment, (key, equals, _) in zip(assignments, pairs, strict=True) if not key or not equals), None)
+    if wrong is not None:
+        raise ConfigError(f"--set {wrong}: write KEY=VALUE, e.g. --set extractor.max_keypoints=2048; the keys are listed by: thegra config")
+    return {key.strip(): value for key, _, value in pairs}
