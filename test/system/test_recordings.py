@@ -1,0 +1,102 @@
+"""The whole system through its command: real and simulated recordings against what it must reach, and the same bytes for the same input."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from thegra_core.config import load_config
+from thegra_core.errors import WeightsError
+from thegra_core.evaluation.benchmark.slam import Plan, execute, planned_runs
+from thegra_core.features.registry import weights_for
+from thegra_core.features.weights import path_of
+from thegra_core.simulation.demo import make_demo_bag
+
+MAX_MEMORY_MB = 2500
+PATIENCE_S = 3600
+SHORT = 0.5
+"""Extent in median depths: the hover's 60 m."""
+
+
+def missing_weights(profile: str) -> str:
+    """What to type to get the profile's weights; empty if they are there."""
+    config = load_config(profile)
+    try:
+        for name in weights_for(config.extractor, config.matcher):
+            path_of(name)
+    except WeightsError as error:
+        return str(error)
+    return ""
+
+
+def figures(recording: Path, out: Path, max_frames: int | None = None) -> dict[str, Any]:
+    """Figures of one run with profile quality and seed 0."""
+    if not recording.is_dir():
+        pytest.skip(f"no recording {recording}")
+    if missing_weights("quality"):
+        pytest.skip(missing_weights("quality"))
+    limits = {recording.name: max_frames} if max_frames is not None else {}
+    plan = Plan((recording,), out, ("quality",), max_frames=limits)
+    (run,) = planned_runs(plan)
+    result = execute(run, plan)
+    assert result.error is None
+    assert result.figures["peak_rss_mb"] < MAX_MEMORY_MB
+    return dict(result.figures)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(PATIENCE_S)
+@pytest.mark.parametrize(
+    ("name", "tracked_pct", "ate_rmse"),
+    [
+        ("kitchen_rgb_7scenes", 95, 0.03),
+        ("sim_corridor_loop", 95, 0.25),
+        ("sim_room_shutter", 60, 0.10),
+        ("forest_f6_line1", 93, 0.25),
+        ("forest_f0", 90, 0.3),
+    ],
+)
+def test_it_tracks(shared_data: Path, tmp_path: Path, name: str, tracked_pct: float, ate_rmse: float) -> None:
+    reached = figures(shared_data / name, tmp_path)
+    assert reached["tracked_pct"] >= tracked_pct
+    assert reached["ate_rmse"] <= ate_rmse
+    assert reached["in_closure"] == 0, "no pose is claimed while the shutter is closed"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(PATIENCE_S)
+def test_a_plane_from_above_is_tracked_or_left_alone(shared_data: Path, tmp_path: Path) -> None:
+    reached = figures(shared_data / "orchard_m2ea_drone", tmp_path, max_frames=15)
+    if reached["maps"] > 0:
+        assert reached["tracked_pct"] >= 80
+        assert reached["ate_rmse"] <= 4
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(PATIENCE_S)
+@pytest.mark.parametrize("name", ["sim_rotation_only", "neg_hover_static_hit"])
+def test_a_camera_that_stays_in_place_starts_no_map(shared_data: Path, tmp_path: Path, name: str) -> None:
+    reached = figures(shared_data / name, tmp_path)
+    assert (reached["maps"], reached["poses"]) == (0, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(PATIENCE_S)
+def test_a_hovering_camera_that_pans_claims_no_journey(shared_data: Path, tmp_path: Path) -> None:
+    assert figures(shared_data / "neg_hover_pan_hit", tmp_path)["extent"] < SHORT
+
+
+def test_same_input_same_bytes(tmp_path: Path) -> None:
+    bag = make_demo_bag(tmp_path / "bag", duration_s=0.8, image_size=(256, 192))
+    extractor = "orb" if missing_weights("fast") else "xfeat"
+    outs = [tmp_path / "first", tmp_path / "second"]
+    for out in outs:
+        command = ["run", bag, "--profile", "fast", "--set", f"extractor.name={extractor}", "--out", out, "--quiet"]
+        subprocess.run([sys.executable, "-m", "thegra_core.cli.main", *map(str, command)], check=True, capture_output=True)
+    first, second = ((out / "trajectory.txt").read_bytes() for out in outs)
+    assert first == second
+    assert first.count(b"\n") >= 5, "bytes of nothing say nothing"
