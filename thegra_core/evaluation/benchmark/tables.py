@@ -34,7 +34,7 @@ def caption(report: Mapping[str, Any]) -> str:
     peers = f" Best peer: the lowest median ATE among systems and variants that track at least {PEER_COVERAGE_PCT:g} %." if report["peers"] else ""
     return (
         f"{seeds}{settings}Tracked: frames of the main map outside shutter closures; ATE after Sim(3) alignment, in the reference's unit, and over its "
-        f"spread (near 75 %: nothing was estimated). Time: median / 95 % of the first run, without the final adjustment.{peers} "
+        f"spread (near 75 %: nothing was estimated). Time: median / 95 % of the first run, without the final adjustment; memory: the most of any run (a run from the cache loads no network).{peers} "
         f"Thegra {report['version']}, {report['machine']['processors']} processors, {report['machine']['platform']}."
     )
 
