@@ -188,7 +188,6 @@ class MappingConfig(Section):
 
     covisibility_threshold: int = Field(15, ge=1, description="shared landmarks that make an edge; ORB-SLAM3: 15")
     neighbours: int = Field(3, ge=1, le=30, description="covisible keyframes that a new keyframe is matched to; ORB-SLAM3: 30, with learned matching each costs a network run")
-    propagate_to: int = Field(10, ge=0, description="covisible keyframes in which new landmarks are looked for by projection")
     good_baseline_ratio: float = Field(0.1, ge=0, description="distance to a neighbour over median depth from which its baseline counts in full when neighbours are chosen")
     epipolar_px: float = Field(2.0, gt=0, description="px to the epipolar line; chi-square 3.84 at 1 px is 1.96 px")
     min_parallax_deg: float = Field(1.0, gt=0, description="degrees between the rays of a new point; ORB-SLAM3: 1.15")
@@ -196,13 +195,13 @@ class MappingConfig(Section):
     max_scale_ratio: float = Field(4.0, gt=1, description="distance of a new point in one view over that in the other")
     min_found_ratio: float = Field(0.25, ge=0, le=1, description="found / predicted visible below which a landmark is culled; paper: 25 %")
     trial_keyframes: int = Field(3, ge=1, description="keyframes after which a landmark must have trial_observations; ORB-SLAM3: 3")
-    trial_observations: int = Field(2, ge=2, description="observations a landmark must have by then")
+    trial_observations: int = Field(3, ge=2, description="observations a landmark must have by then; ORB-SLAM3: 3")
 
 
 class BundleConfig(Section):
     """Local and full bundle adjustment."""
 
-    local_keyframes: int = Field(12, ge=2, description="keyframes optimised with the new one")
+    local_keyframes: int = Field(20, ge=2, description="keyframes optimised with the new one; a window of 12 drifts more in scale where keyframes follow each other closely (measured)")
     fixed_keyframes: int = Field(20, ge=1, description="outer keyframes kept fixed at the most")
     iterations: int = Field(10, ge=1, description="Levenberg-Marquardt steps a stage")
     full_iterations: int = Field(30, ge=1, description="steps of the full adjustment at the end")
@@ -224,6 +223,7 @@ class ThegraConfig(Section):
 
     profile: str = Field("quality", description="the profile the values started from")
     seed: int = Field(0, ge=0, description="of every random choice")
+    threads: int = Field(1, ge=1, description="CPU threads of the networks, unless OMP_NUM_THREADS says otherwise; more help only where that many cores are idle")
     weighting: Literal["normalized", "paper", "uniform"] = Field("normalized", description="observation weights from detection scores: over the keyframe's median; the literal score squared (paper Eq. 1); none")
     preprocessing: PreprocessingConfig = PreprocessingConfig()
     extractor: ExtractorConfig = ExtractorConfig()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shlex
 import signal
 import sys
@@ -125,6 +126,8 @@ def run_recording(options: RunOptions) -> int:
 
 def make_system(camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None) -> System:
     """The SLAM system; imported here because the networks take seconds to load."""
+    # read by torch when it is imported, which a cache may make unnecessary
+    os.environ.setdefault("OMP_NUM_THREADS", str(config.threads))
     from thegra_core.slam import Slam
 
     return Slam(camera, config, extractor, matcher)

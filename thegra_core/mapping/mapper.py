@@ -14,7 +14,6 @@ from thegra_core.map.map import Map
 from thegra_core.mapping import culling
 from thegra_core.mapping.adjustment import adjust_all, adjust_locally
 from thegra_core.mapping.expansion import expand
-from thegra_core.mapping.propagation import propagate
 from thegra_core.messages import InitialMap, Keyframe, MapSummary, MapUpdate, Matches
 
 logger = logging.getLogger(__name__)
@@ -107,10 +106,7 @@ class Mapper:
         before = editor.next_landmark
         for neighbour, matches in known.items():
             expand(editor, keyframe.id, neighbour, matches, self._config.mapping)
-        created = np.arange(before, editor.next_landmark, dtype=np.int64)
-        self._trial[keyframe.map_id].extend(created.tolist())
-        others = [i for i in editor.map.neighbours(keyframe.id, self._config.mapping.propagate_to) if i not in known]
-        propagate(editor, created, others, self._config.tracking)
+        self._trial[keyframe.map_id].extend(range(before, editor.next_landmark))
 
     def _choose_neighbours(self, editor: MapEditor, keyframe: Keyframe) -> list[int]:
         """Covisible keyframes to match: those that share much and stand far enough apart for new points to have parallax.
