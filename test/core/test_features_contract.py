@@ -246,7 +246,9 @@ def test_known_motion_is_found(name: str, kind: str, angle_deg: float, shift: tu
     assert right.mean() > 0.7
     # Some networks put their points a pixel or two beside the corner, always to the same side of the picture (measured on thermal frames: aliked
     # (1.0, 0.4), xfeat (0.3, -1.3) px). A turned view moves that offset against the scene, by a fifth of it at 12 degrees; a shifted view does not.
-    assert np.all(np.abs(errors[right].mean(axis=0)) < (0.3 if angle_deg == 0 else 0.6))
+    # XFeat's points are whole pixels: a shift by a fraction may round to the same side nearly everywhere, by half a pixel at most on average.
+    bound = 0.6 if angle_deg else (0.5 if name == "xfeat" else 0.3)
+    assert np.all(np.abs(errors[right].mean(axis=0)) < bound)
 
 
 @pytest.mark.parametrize(("name", "kind"), PAIRS)
