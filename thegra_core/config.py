@@ -156,6 +156,7 @@ class InitializationConfig(Section):
     min_parallax_to_noise: float = Field(3.0, ge=1, description="residual of the best pure rotation over what the matches' noise alone would leave, for many matches; more is asked of few; a camera that only turns gives 1 to 2.9 (measured)")
     min_inlier_ratio: float = Field(0.5, ge=0, le=1, description="share of the matches that the first map must explain")
     ambiguity_ratio: float = Field(1.3, ge=1, description="least cost of the second-best motion hypothesis over the best; below it the start waits (plane seen by few views)")
+    probation_frames: int = Field(3, ge=0, description="frames that must be tracked in a new map before a pose in it is claimed; a map that fails one is dropped; 0: claimed at once")
     between_views: int = Field(3, ge=0, le=10, description="frames between reference and current that take part in the first bundle adjustment and tell a plane's two motions apart")
 
 

@@ -88,7 +88,7 @@ class Slam:
             output = self._tracking.hold(frame.stamp_ns, shutter.reason) if shutter.shutter is Shutter.CLOSED else self._see(frame)
         self._stage_ms["total"] = 1e3 * (time.perf_counter() - begin)
         result = replace(output.result, stage_ms=dict(self._stage_ms))
-        self._record(frame.index, result, bad=bool(trouble))
+        self._record(frame.index, result, output.provisional, bad=bool(trouble))
         return result
 
     def snapshot(self) -> Snapshot | None:
@@ -105,6 +105,9 @@ class Slam:
     def finish(self, progress: Callable[[str], None] | None = None) -> Run:
         """Full bundle adjustment, late localisation of frames without a pose, and the account of the run."""
         say = progress or (lambda _: None)
+        unproven = self._tracking.drop_unproven()
+        if unproven is not None:
+            self._drop(unproven)
         say("full bundle adjustment")
         for map_id in self._mapper.map_ids:
             update = self._mapper.finish(map_id)
@@ -145,6 +148,8 @@ class Slam:
             matches = self._matcher.match(features, reference) if reference is not None else None
         with self._timed("tracking"):
             output = self._tracking.process(features, matches)
+        if output.dropped_map_id is not None:
+            self._drop(output.dropped_map_id)
         with self._timed("mapping"):
             if output.initial_map is not None:
                 self._tracking.apply(self._mapper.initialize(output.initial_map))
@@ -182,13 +187,19 @@ class Slam:
             else:
                 self._closures.append((shutter.stamp_ns, shutter.stamp_ns))
 
-    def _record(self, index: int, result: TrackingResult, bad: bool) -> None:
-        if result.state is not TrackingState.TRACKING or result.world_from_camera is None:
+    def _record(self, index: int, result: TrackingResult, provisional: TrackingResult | None, bad: bool) -> None:
+        placed = provisional or result
+        if placed.state is not TrackingState.TRACKING or placed.world_from_camera is None:
             self._frames.append(_Placed(result, index, bad=bad))
             return
-        reference = self._mapper.map(result.map_id).keyframes[result.reference_id]
-        relative = np.eye(4) if result.is_keyframe else reference.camera_from_world @ result.world_from_camera
-        self._frames.append(_Placed(result, index, result.map_id, result.reference_id, relative))
+        reference = self._mapper.map(placed.map_id).keyframes[placed.reference_id]
+        relative = np.eye(4) if placed.is_keyframe else reference.camera_from_world @ placed.world_from_camera
+        self._frames.append(_Placed(result, index, placed.map_id, placed.reference_id, relative, afterwards=provisional is not None))
+
+    def _drop(self, map_id: int) -> None:
+        """Forget a map and the places of frames in it."""
+        self._mapper.drop(map_id)
+        self._frames = [_Placed(p.result, p.index, bad=p.bad) if p.map_id == map_id else p for p in self._frames]
 
     @staticmethod
     def _final(placed: _Placed, maps: dict[int, Map], keyframe_by_stamp: dict[tuple[int, int], int]) -> FrameRecord:

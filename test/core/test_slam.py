@@ -143,6 +143,19 @@ def test_a_lost_camera_begins_a_new_map_and_keeps_the_old() -> None:
     assert len(first) == 25, "frames before the first map are placed in it although a second one followed"
 
 
+def test_frames_on_probation_have_a_place_only_if_the_map_stands(loop_run: tuple[list[TrackingResult], Run]) -> None:
+    results, run = loop_run
+    on_probation = [i for i, r in enumerate(results) if "probation" in r.reason]
+    assert len(on_probation) == CONFIG.initialization.probation_frames
+    assert all(run.frames[i].map_id == 0 and run.frames[i].localized_afterwards for i in on_probation)
+    slam = make(room(), loop(120))
+    for frame in frames(on_probation[1]):
+        slam.process(frame)
+    unproven = slam.finish()
+    assert (unproven.maps, unproven.main_map_id) == ((), -1)
+    assert all(f.world_from_camera is None for f in unproven.frames)
+
+
 def test_hold_while_the_image_repeats() -> None:
     slam = make(walk_world(), WALK)
     stream = frames(40)

@@ -31,6 +31,8 @@ class Pair:
     def see(self, features: Features) -> TrackingOutput:
         reference = self.tracking.reference_features
         output = self.tracking.process(features, None if reference is None else self.matcher.match(features, reference))
+        if output.dropped_map_id is not None:
+            self.mapper.drop(output.dropped_map_id)
         update = None
         if output.initial_map is not None:
             update = self.mapper.initialize(output.initial_map)
@@ -213,6 +215,65 @@ def test_a_camera_that_stays_elsewhere_begins_a_new_map_beside_the_old() -> None
     assert position_error(pair.outputs[:20], sideways(20, 0.05))[0] < 0.01
     second = [o for o in pair.outputs[20:] if o.result.map_id == 1]
     assert {o.result.map_id for o in pair.outputs[40:]} == {1} and len(second) > 25
+
+
+def until_first_map(pair: Pair, world: World) -> int:
+    """See the world until a map begins; the number of frames that took."""
+    for index, pose in enumerate(sideways(40, 0.05)):
+        if pair.see(observe(world, pose, stamp(index), 0.3, 0.9, 10)).initial_map is not None:
+            return index + 1
+    raise AssertionError("no map began")
+
+
+def test_a_new_map_claims_nothing_until_it_has_been_tracked() -> None:
+    pair, world = Pair(), cloud(count=500, seed=4)
+    begun = until_first_map(pair, world)
+    probation = CONFIG.initialization.probation_frames
+    pair.run(world, sideways(40, 0.05)[begun : begun + probation], begin=begun)
+    first, *between, claimed = pair.outputs[begun - 1 :]
+    for output in (first, *between):
+        assert output.result.state is TrackingState.INITIALIZING and output.result.world_from_camera is None and "probation" in output.result.reason
+        assert output.provisional is not None and output.provisional.state is TrackingState.TRACKING and output.provisional.covariance is not None
+        assert (np.linalg.eigvalsh(output.provisional.covariance) > 0).all()
+    assert claimed.provisional is None and claimed.result.state is TrackingState.TRACKING
+    hasty = Pair(ThegraConfig.model_validate({"initialization": {"probation_frames": 0}}))
+    until_first_map(hasty, world)
+    assert hasty.outputs[-1].result.state is TrackingState.TRACKING
+
+
+def test_a_map_that_the_next_frames_do_not_fit_is_dropped() -> None:
+    pair = Pair()
+    begun = until_first_map(pair, cloud(count=500, seed=4))
+    pair.run(cloud(count=500, seed=5), sideways(60, 0.05)[begun:], begin=begun)
+    dropped = [o.dropped_map_id for o in pair.outputs]
+    assert dropped.index(0) == begun and pair.mapper.map_ids == [1] and pair.tracking.map_id == 1
+    assert {o.result.map_id for o in pair.outputs if o.result.world_from_camera is not None} == {1}
+    assert pair.tracking.losses == 0, "nothing was claimed, so nothing was lost"
+    pair.tracking.apply(pair.updates[0])
+    assert pair.tracking.map_id == 1, "a late update of the dropped map changes nothing"
+
+
+def test_a_dropped_second_map_leaves_the_first_to_be_found_again() -> None:
+    pair, home, path = Pair(), cloud(count=500, seed=4), sideways(60, 0.05)
+    pair.run(home, path[:20])
+    pair.run(cloud(count=500, seed=5), path[20:50], begin=20)
+    begun = next(i for i, o in enumerate(pair.outputs) if o.initial_map is not None and o.initial_map.map_id == 1)
+    again = Pair()
+    again.run(home, path[:20])
+    again.run(cloud(count=500, seed=5), path[20 : begun + 1], begin=20)
+    assert again.mapper.map_ids == [0, 1]
+    again.run(home, path[begun + 1 : begun + 6], begin=begun + 1)
+    after = again.outputs[begun + 1 :]
+    assert after[0].dropped_map_id == 1 and after[0].result.state is TrackingState.LOST
+    assert {o.result.map_id for o in after[1:]} == {0} and {o.result.state for o in after[1:]} == {TrackingState.TRACKING}
+    assert (again.tracking.losses, again.tracking.relocalizations, again.mapper.map_ids) == (1, 1, [0])
+
+
+def test_a_run_that_ends_on_probation_has_no_map() -> None:
+    pair = Pair()
+    until_first_map(pair, cloud(count=500, seed=4))
+    assert pair.tracking.drop_unproven() == 0
+    assert pair.tracking.map_id == -1 and pair.tracking.drop_unproven() is None
 
 
 def test_hold_predicts_with_constant_velocity_and_changes_nothing() -> None:

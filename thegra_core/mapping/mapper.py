@@ -64,6 +64,10 @@ class Mapper:
         adjust_all(editor, self._config)
         return editor.take_update()
 
+    def drop(self, map_id: int) -> None:
+        """Forget a map that tracking has given up."""
+        del self._editors[map_id], self._trial[map_id]
+
     @property
     def map_ids(self) -> list[int]:
         return sorted(self._editors)

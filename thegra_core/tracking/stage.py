@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,12 @@ from thegra_core.features.protocols import Matcher
 from thegra_core.geometry import poses
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map
-from thegra_core.messages import Features, InitialMap, Keyframe, MapUpdate, Matches, TrackingResult, TrackingState, VisibilityCounts
+from thegra_core.messages import NO_LANDMARK, Features, InitialMap, Keyframe, MapUpdate, Matches, TrackingResult, TrackingState, VisibilityCounts
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
 from thegra_core.tracking.motion import MotionModel
 from thegra_core.tracking.relocalizer import last_keyframes, nearest_in_time, relocalize
-from thegra_core.tracking.tracker import Localization, best_reference, localize
+from thegra_core.tracking.tracker import FrameView, Localization, best_reference, localize
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -30,7 +30,8 @@ logger = logging.getLogger(__name__)
 class TrackingOutput:
     """What tracking says about a frame: the result, and what mapping has to do about it, if anything.
 
-    landmark_ids (N,) per keypoint and the matches used are for viewers; None where there are none.
+    While a new map is on probation nothing is claimed: `result` has no pose, and `provisional` is the result that holds if the map stands.
+    `dropped_map_id` names a map that did not stand. landmark_ids (N,) per keypoint and the matches used are for viewers; None where there are none.
     """
 
     result: TrackingResult
@@ -38,6 +39,8 @@ class TrackingOutput:
     initial_map: InitialMap | None = None
     landmark_ids: IntArray | None = None
     matches: Matches | None = None
+    provisional: TrackingResult | None = None
+    dropped_map_id: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +53,37 @@ class LateLocalization:
     reference_from_camera: FloatArray
 
 
+@dataclass(slots=True)
+class _Place:
+    """Where tracking is: a replica of a map, keyframes of it, and what has been seen since the last one."""
+
+    map: Map
+    reference_id: int
+    last_keyframe_id: int
+    probation: int
+    lost_frames: int = 0
+    motion: MotionModel = field(default_factory=MotionModel)
+    visible: list[IntArray] = field(default_factory=list)
+    found: list[IntArray] = field(default_factory=list)
+
+    @property
+    def reference(self) -> Features:
+        return self.map.keyframes[self.reference_id].features
+
+    def predict(self, stamp_ns: int) -> FloatArray | None:
+        return self.motion.predict(stamp_ns) if self.lost_frames == 0 else None
+
+    def take_counts(self) -> VisibilityCounts:
+        visible, visible_counts = np.unique(np.concatenate(self.visible), return_counts=True)
+        found, found_counts = np.unique(np.concatenate(self.found), return_counts=True)
+        counts = np.zeros(len(visible), dtype=np.int64)
+        counts[np.searchsorted(visible, found)] = found_counts
+        self.visible, self.found = [], []
+        return VisibilityCounts(visible, visible_counts.astype(np.int64), counts)
+
+
 class TrackingStage:
-    """State of tracking: a replica of the current map, the reference keyframe, the motion model, and the search for a first map.
+    """State of tracking: the place in the current map, the map before it while a new one is on probation, and the search for a first map.
 
     Call `process` (or `hold`) once a frame, hand what it returns to mapping, and `apply` every update that mapping sends back.
     """
@@ -61,15 +93,10 @@ class TrackingStage:
         self._config = config
         self._matcher = matcher
         self._initializer = Initializer(camera, config, matcher)
-        self._motion = MotionModel()
-        self._map: Map | None = None
-        self._reference_id = -1
-        self._last_keyframe_id = -1
+        self._place: _Place | None = None
+        self._before: _Place | None = None
         self._next_keyframe_id = 0
         self._next_map_id = 0
-        self._lost_frames = 0
-        self._visible: list[IntArray] = []
-        self._found: list[IntArray] = []
         self._unplaced: deque[Features] = deque(maxlen=config.relocalization.remembered_frames)
         self.losses = 0
         self.relocalizations = 0
@@ -77,55 +104,68 @@ class TrackingStage:
     @property
     def reference_features(self) -> Features | None:
         """What the front end should match the next frame to."""
-        return self._initializer.reference_features if self._map is None else self._map.keyframes[self._reference_id].features
+        return self._initializer.reference_features if self._place is None else self._place.reference
 
     @property
     def map_id(self) -> int:
-        return self._map.map_id if self._map is not None else -1
+        return self._place.map.map_id if self._place is not None else -1
 
     def process(self, features: Features, matches: Matches | None) -> TrackingOutput:
         """Track one frame; `matches` are to `reference_features` (None: not matched yet)."""
-        if self._map is None:
+        place = self._place
+        if place is None:
             return self._start(features, matches)
-        if matches is None or matches.reference_stamp_ns != self._map.keyframes[self._reference_id].stamp_ns:
-            matches = self._matcher.match(features, self._map.keyframes[self._reference_id].features)
-        predicted = self._motion.predict(features.stamp_ns) if self._lost_frames == 0 else None
-        found = localize(self._map, features, self._reference_id, matches, predicted, self._config)
+        if matches is None or matches.reference_stamp_ns != place.reference.stamp_ns:
+            matches = self._matcher.match(features, place.reference)
+        found = localize(place.map, features, place.reference_id, matches, place.predict(features.stamp_ns), self._config)
         if isinstance(found, str):
-            return self._recover(features, found)
-        return self._accept(features, found, matches)
+            return self._recover(place, features, found)
+        return self._accept(place, features, found, matches)
 
     def hold(self, stamp_ns: int, reason: str) -> TrackingOutput:
         """A frame that shows nothing (shutter closed): the pose is predicted, and marked as that."""
-        predicted = self._motion.predict(stamp_ns) if self._lost_frames == 0 else None
-        return TrackingOutput(TrackingResult(stamp_ns, TrackingState.HOLD, predicted, map_id=self.map_id, reference_id=self._reference_id, reason=reason))
+        place = self._place
+        if place is None or place.probation:
+            return TrackingOutput(TrackingResult(stamp_ns, TrackingState.HOLD, reason=reason))
+        predicted = place.predict(stamp_ns)
+        return TrackingOutput(TrackingResult(stamp_ns, TrackingState.HOLD, predicted, map_id=self.map_id, reference_id=place.reference_id, reason=reason))
 
     def apply(self, update: MapUpdate) -> None:
-        """Bring the replica up to date; the newest keyframe becomes the reference and the motion model follows its correction."""
-        if self._map is None or self._map.map_id != update.map_id:
-            self._map = Map(update.map_id, self._camera)
+        """Bring the replica up to date; the newest keyframe becomes the reference and the motion model follows its correction.
+
+        Updates of a map that was dropped in the meantime are ignored.
+        """
+        for place in (self._place, self._before):
+            if place is not None and place.map.map_id == update.map_id:
+                break
+        else:
+            return
         before = {m.id: m.world_from_camera for m in update.new_keyframes}
-        self._map.apply(update)
+        place.map.apply(update)
         if before:
             newest = max(before)
-            self._reference_id = self._last_keyframe_id = newest
-            self._motion.move(self._map.keyframes[newest].world_from_camera @ poses.inverse(before[newest]))
+            place.reference_id = place.last_keyframe_id = newest
+            place.motion.move(place.map.keyframes[newest].world_from_camera @ poses.inverse(before[newest]))
+
+    def drop_unproven(self) -> int | None:
+        """At the end of a run: give up a map that is still on probation; its id, or None."""
+        return self._drop() if self._place is not None and self._place.probation else None
 
     def localize_afterwards(self) -> list[LateLocalization]:
         """Place frames that had no pose at their time in the current map, by the keyframes nearest in time."""
         placed: list[LateLocalization] = []
-        if self._map is None:
+        if self._place is None:
             return placed
-        keyframe_stamps = {k.stamp_ns for k in self._map.keyframes.values()}
+        current = self._place.map
+        keyframe_stamps = {k.stamp_ns for k in current.keyframes.values()}
         for features in self._unplaced:
             if features.stamp_ns in keyframe_stamps:
                 continue
-            candidates = nearest_in_time(self._map, features.stamp_ns, 2)
-            found = relocalize(self._map, features, candidates, self._matcher, self._config, self._config.relocalization.min_inliers)
+            candidates = nearest_in_time(current, features.stamp_ns, 2)
+            found = relocalize(current, features, candidates, self._matcher, self._config, self._config.relocalization.min_inliers)
             if found is not None:
-                reference = self._map.keyframes[found[1]]
-                relative = reference.camera_from_world @ found[0].world_from_camera
-                placed.append(LateLocalization(features.stamp_ns, self._map.map_id, found[1], relative))
+                relative = current.keyframes[found[1]].camera_from_world @ found[0].world_from_camera
+                placed.append(LateLocalization(features.stamp_ns, current.map_id, found[1], relative))
         return placed
 
     # ---- steps ----------------------------------------------------------------------------------------------------------------------
@@ -139,91 +179,104 @@ class TrackingStage:
         return self._begin_map(features, initial)
 
     def _begin_map(self, features: Features, initial: InitialMap) -> TrackingOutput:
-        self._initializer.reset()
+        last = initial.keyframes[-1]
+        place = _Place(Map(initial.map_id, self._camera), last.id, last.id, self._config.initialization.probation_frames)
+        for keyframe in initial.keyframes[-2:]:
+            place.motion.update(keyframe.stamp_ns, keyframe.world_from_camera)
+        self._before, self._place = self._place, place
         self._next_map_id += 1
         self._next_keyframe_id += len(initial.keyframes)
-        self._lost_frames = 0
-        self._visible, self._found = [], []
-        self._motion.reset()
-        for keyframe in initial.keyframes[-2:]:
-            self._motion.update(keyframe.stamp_ns, keyframe.world_from_camera)
-        last = initial.keyframes[-1]
-        seen = int((last.landmark_ids >= 0).sum())
+        keypoints = np.flatnonzero(last.landmark_ids != NO_LANDMARK)
+        estimate = FrameView(features, self._camera, self._config).refine(
+            poses.inverse(last.world_from_camera), initial.points_world[last.landmark_ids[keypoints]], keypoints, self._config.tracking.chi2_px2
+        )
+        seen = len(keypoints)
         result = TrackingResult(
-            features.stamp_ns, TrackingState.TRACKING, last.world_from_camera, np.eye(6) * 1e-6, self._motion.twist(), len(features), seen, seen, seen,
+            features.stamp_ns, TrackingState.TRACKING, last.world_from_camera, estimate.covariance, place.motion.twist(), len(features), seen, seen, seen,
             is_keyframe=True, map_id=initial.map_id, reference_id=last.id, reason="first map",
         )  # fmt: skip
-        return TrackingOutput(result, initial_map=initial, landmark_ids=last.landmark_ids, matches=last.reference_matches)
+        return self._claim(place, features, TrackingOutput(result, initial_map=initial, landmark_ids=last.landmark_ids, matches=last.reference_matches))
 
-    def _accept(self, features: Features, found: Localization, matches: Matches) -> TrackingOutput:
-        assert self._map is not None
-        if self._lost_frames:
-            self._lost_frames = 0
+    def _accept(self, place: _Place, features: Features, found: Localization, matches: Matches) -> TrackingOutput:
+        if place.lost_frames:
+            place.lost_frames = 0
             self.relocalizations += 1
-            self._initializer.reset()
-            self._motion.reset()
+            place.motion.reset()
+        place.probation = max(0, place.probation - 1)
         world_from_camera = found.world_from_camera
-        self._motion.update(features.stamp_ns, world_from_camera)
-        self._visible.append(found.visible_ids)
-        self._found.append(found.landmark_ids[found.landmark_ids >= 0])
-        matched_to = self._reference_id
-        keyframe = self._as_keyframe(features, found, matches)
+        place.motion.update(features.stamp_ns, world_from_camera)
+        place.visible.append(found.visible_ids)
+        place.found.append(found.landmark_ids[found.landmark_ids >= 0])
+        matched_to = place.reference_id
+        keyframe = self._as_keyframe(place, features, found, matches)
         if keyframe is None:
-            local = self._map.local_keyframes(self._reference_id, self._config.tracking.local_keyframes)
-            self._reference_id = best_reference(self._map, found.landmark_ids, local)
+            local = place.map.local_keyframes(place.reference_id, self._config.tracking.local_keyframes)
+            place.reference_id = best_reference(place.map, found.landmark_ids, local)
         result = TrackingResult(
-            features.stamp_ns, TrackingState.TRACKING, world_from_camera, found.covariance, self._motion.twist(), len(features), found.matches,
-            found.inliers, len(found.visible_ids), keyframe is not None, self._map.map_id, keyframe.id if keyframe is not None else matched_to,
+            features.stamp_ns, TrackingState.TRACKING, world_from_camera, found.covariance, place.motion.twist(), len(features), found.matches,
+            found.inliers, len(found.visible_ids), keyframe is not None, place.map.map_id, keyframe.id if keyframe is not None else matched_to,
         )  # fmt: skip
-        return TrackingOutput(result, keyframe, landmark_ids=found.landmark_ids, matches=matches)
+        return self._claim(place, features, TrackingOutput(result, keyframe, landmark_ids=found.landmark_ids, matches=matches))
 
-    def _as_keyframe(self, features: Features, found: Localization, matches: Matches) -> Keyframe | None:
+    def _claim(self, place: _Place, features: Features, output: TrackingOutput) -> TrackingOutput:
+        """The output as it may be told: a pose only once the map has stood its probation."""
+        if place.probation == 0:
+            self._initializer.reset()
+            self._before = None
+            return output
+        self._unplaced.append(features)
+        state = TrackingState.INITIALIZING if self._before is None else TrackingState.LOST
+        reason = f"a first map on probation: {place.probation} more frames must fit it"
+        counts = TrackingResult(features.stamp_ns, state, keypoints=len(features), matches=output.result.matches, inliers=output.result.inliers, reason=reason)
+        return replace(output, result=counts, provisional=output.result)
+
+    def _as_keyframe(self, place: _Place, features: Features, found: Localization, matches: Matches) -> Keyframe | None:
         """The frame as a keyframe message if one is due."""
-        assert self._map is not None
-        last = self._map.keyframes[self._last_keyframe_id]
-        reference = self._map.keyframes[self._reference_id]
-        tracked_ratio = found.inliers / max(int((self._map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
-        depth = self._map.median_depth(self._reference_id, found.world_from_camera)
-        reason = needs_keyframe(last.world_from_camera, found.world_from_camera, depth, tracked_ratio, self._config.keyframe)
-        if not reason:
+        last, reference = place.map.keyframes[place.last_keyframe_id], place.map.keyframes[place.reference_id]
+        tracked_ratio = found.inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
+        depth = place.map.median_depth(place.reference_id, found.world_from_camera)
+        if not needs_keyframe(last.world_from_camera, found.world_from_camera, depth, tracked_ratio, self._config.keyframe):
             return None
-        visible, visible_counts = np.unique(np.concatenate(self._visible), return_counts=True)
-        found_ids, found_counts = np.unique(np.concatenate(self._found), return_counts=True)
-        counts = np.zeros(len(visible), dtype=np.int64)
-        counts[np.searchsorted(visible, found_ids)] = found_counts
-        self._visible, self._found = [], []
         keyframe = Keyframe(
-            self._next_keyframe_id, features.stamp_ns, found.world_from_camera, features, found.landmark_ids, self._reference_id, self._map.map_id,
-            matches, VisibilityCounts(visible, visible_counts.astype(np.int64), counts),
+            self._next_keyframe_id, features.stamp_ns, found.world_from_camera, features, found.landmark_ids, place.reference_id, place.map.map_id,
+            matches, place.take_counts(),
         )  # fmt: skip
         self._next_keyframe_id += 1
         return keyframe
 
-    def _recover(self, features: Features, reason: str) -> TrackingOutput:
-        """Tracking failed: the last keyframes, then a new map beside the old one."""
-        assert self._map is not None
+    def _recover(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
+        """Tracking failed: drop a map on probation; else the last keyframes, then a new map beside the old one."""
+        if place.probation:
+            dropped = self._drop()
+            logger.info("map %s did not stand its probation: %s", dropped, reason)
+            output = self._start(features, None) if self._place is None else self._stay_lost(self._place, features, reason)
+            return replace(output, dropped_map_id=dropped)
         settings = self._config.relocalization
-        candidates = last_keyframes(self._map, self._reference_id, settings.keyframes)
-        least = self._config.tracking.min_inliers if self._lost_frames == 0 else settings.min_inliers
-        found = relocalize(self._map, features, candidates, self._matcher, self._config, least)
+        candidates = last_keyframes(place.map, place.reference_id, settings.keyframes)
+        least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
+        found = relocalize(place.map, features, candidates, self._matcher, self._config, least)
         if found is not None:
-            self._reference_id = found[1]
-            return self._accept(features, found[0], found[2])
-        if self._lost_frames == 0:
+            place.reference_id = found[1]
+            return self._accept(place, features, found[0], found[2])
+        return self._stay_lost(place, features, reason)
+
+    def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
+        if place.lost_frames == 0:
             self.losses += 1
             logger.warning("lost at %.3f s: %s", features.stamp_ns / 1e9, reason)
-        self._lost_frames += 1
-        if self._lost_frames >= settings.new_map_after_frames:
+        place.lost_frames += 1
+        if place.lost_frames >= self._config.relocalization.new_map_after_frames:
             initial = self._initializer.add(features, None, self._next_map_id, self._next_keyframe_id)
             if not isinstance(initial, str):
-                logger.info("map %d continues after %d frames lost", initial.map_id, self._lost_frames)
+                logger.info("map %d continues after %d frames lost", initial.map_id, place.lost_frames)
                 return self._begin_map(features, initial)
             reason = f"{reason}; a new map waits: {initial}"
         self._unplaced.append(features)
-        result = TrackingResult(features.stamp_ns, TrackingState.LOST, keypoints=len(features), map_id=self._map.map_id, reason=reason)
-        return TrackingOutput(result)
+        return TrackingOutput(TrackingResult(features.stamp_ns, TrackingState.LOST, keypoints=len(features), map_id=place.map.map_id, reason=reason))
 
-
-def with_times(result: TrackingResult, stage_ms: dict[str, float]) -> TrackingResult:
-    """The result with the stages' milliseconds."""
-    return replace(result, stage_ms=stage_ms)
+    def _drop(self) -> int:
+        """Back to where tracking was before the current map began."""
+        assert self._place is not None
+        dropped = self._place.map.map_id
+        self._place, self._before = self._before, None
+        return dropped

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
 from thegra_core.geometry import poses
+from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map
 from thegra_core.map.projection import VisibleLandmarks, match_by_projection, visible_landmarks
 from thegra_core.messages import NO_LANDMARK, Features, Matches
@@ -44,13 +45,13 @@ class Localization:
 class FrameView:
     """A frame's features with what each step needs of them: undistorted coordinates (N, 2), weights (N,) and gate weights (N,)."""
 
-    def __init__(self, features: Features, current: Map, config: ThegraConfig) -> None:
+    def __init__(self, features: Features, camera: CameraModel, config: ThegraConfig) -> None:
         self.features = features
-        self.normalized = current.camera.undistort(features.keypoints.astype(np.float64))
+        self.normalized = camera.undistort(features.keypoints.astype(np.float64))
         self.defined = np.asarray(np.isfinite(self.normalized).all(axis=1))
         self.weights = observation_weights(features.scores, config.weighting)
         self.gates = gate_weights(self.weights, config.weighting)
-        self.focal = current.camera.focal
+        self.focal = camera.focal
 
     def refine(self, camera_from_world: FloatArray, points_world: FloatArray, keypoints: IntArray, chi2_px2: float) -> PoseEstimate:
         """Motion-only bundle adjustment on points (M, 3) seen by keypoints (M,)."""
@@ -74,7 +75,7 @@ def localize(
     descriptor, and a second motion-only bundle adjustment uses both.
     """
     settings = config.tracking
-    view = FrameView(features, current, config)
+    view = FrameView(features, current.camera, config)
     landmark_ids = np.full(len(features), NO_LANDMARK, dtype=np.int64)
     radius = settings.search_radius_px
 
