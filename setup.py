@@ -34,7 +34,7 @@ TEST = ["pytest>=8", "pytest-timeout>=2.2", "hypothesis>=6.100", "evo>=1.28", "p
 EXTRAS = {
     "test": TEST,
     "dev": [*TEST, "ruff>=0.5", "mypy>=1.10", "types-PyYAML", "import-linter>=2.1"],
-    "viz": ["rerun-sdk>=0.20"],
+    "viz": ["rerun-sdk>=0.23"],
     "ros": [
         "ros-jazzy-rclpy",
         "ros-jazzy-common-interfaces",
