@@ -86,7 +86,7 @@ def test_errors_are_of_the_main_map_over_the_frames_of_the_run(groundtruth: Path
 def test_every_file_is_written(tmp_path: Path, groundtruth: Path) -> None:
     run, out = make_run(other_map_from=17, noise=0.01), tmp_path / "out"
     written = write_run(run, out, load_config("fast"), facts(tmp_path), groundtruth, TIMING)
-    names = {"trajectory.txt", "trajectory_live.txt", "trajectory_map1.txt", "predicted.txt", "keyframes.txt", "map.ply", "metrics.json", "config.yaml", "report.html"}
+    names = {"trajectory.txt", "trajectory_live.txt", "trajectory_map1.txt", "predicted.txt", "keyframes.txt", "map.ply", "metrics.json", "config.yaml", "report.html", "overview.png"}
     assert {p.name for p in out.iterdir()} == names
     assert {p.name for p in written.files} == names
     metrics = json.loads((out / "metrics.json").read_text())

@@ -124,6 +124,21 @@ def test_frames_show_the_images_given(tmp_path: Path) -> None:
     assert text.count(f"viewBox=\"0 0 {SIZE[0]} {SIZE[1]}\"") == len(run.snapshots)
 
 
+def test_the_overview_shows_frame_and_map(tmp_path: Path) -> None:
+    pictures = []
+    for with_truth in (True, False):
+        report_of(make_run(noise=0.01), tmp_path, with_truth)
+        pictures.append(cv2.imread(str(tmp_path / "out" / "overview.png")))
+    for picture in pictures:
+        assert picture is not None and min(picture.shape[:2]) > 300
+        half = picture.shape[1] // 2
+        assert np.ptp(picture[:, :half].astype(int), axis=2).max() > 100, "tracks are coloured on the grey frame"
+        assert np.ptp(picture[:, half:].astype(int), axis=2).max() > 100, "the path is coloured"
+    assert not np.array_equal(*pictures), "the ground truth is drawn"
+    report_of(make_run("iiii", localized=()), tmp_path)
+    assert not (tmp_path / "out" / "overview.png").exists(), "no map, no picture, and none of an earlier run"
+
+
 @pytest.mark.parametrize("states", ["", "i", "iiiii", "t", "tt", "lhlhl"])
 @pytest.mark.parametrize("with_truth", [True, False])
 def test_runs_with_little_in_them_have_a_page(tmp_path: Path, states: str, with_truth: bool) -> None:

@@ -78,7 +78,7 @@ def write_run(run: Run, out_dir: Path, config: ThegraConfig, recording: Recordin
         scores = score_run(run, truth) if truth is not None else None
         metrics = run_metrics(run, config, timing, scores, recording.problems)
         files.append(write_atomic(out_dir / "metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n"))
-        files.append(_write_report(run, out_dir, config, recording, metrics, truth, scores))
+        files.extend(_write_report(run, out_dir, config, recording, metrics, truth, scores))
     except OSError as error:
         raise InputError(f"cannot write to {out_dir}: {error.strerror}; choose another folder with --out DIR") from error
     if problem is not None:
@@ -148,27 +148,34 @@ def _write_points(run: Run, out_dir: Path) -> Path:
 
 def _write_report(
     run: Run, out_dir: Path, config: ThegraConfig, recording: RecordingFacts, metrics: dict[str, Any], truth: Trajectory | None, scores: RunScores | None
-) -> Path:
-    from thegra_core.outputs.report.build import ReportInput, build_report  # matplotlib and jinja2 take a second to import
+) -> list[Path]:
+    """The page, and the picture where there is a map."""
+    from thegra_core.outputs.report.build import ReportInput, build_report, run_poses  # matplotlib and jinja2 take a second to import
+    from thegra_core.outputs.report.overview import overview
 
-    content = build_report(
-        ReportInput(
-            run=run,
-            config=config,
-            metrics=metrics,
-            name=recording.name,
-            path=str(recording.path),
-            topic=recording.topic,
-            image_size=recording.camera.image_size,
-            problems=recording.problems,
-            notes=recording.notes,
-            command=recording.command,
-            started_utc=recording.started_utc,
-            groundtruth=truth,
-            scores=scores,
-        )
+    report = ReportInput(
+        run=run,
+        config=config,
+        metrics=metrics,
+        name=recording.name,
+        path=str(recording.path),
+        topic=recording.topic,
+        image_size=recording.camera.image_size,
+        problems=recording.problems,
+        notes=recording.notes,
+        command=recording.command,
+        started_utc=recording.started_utc,
+        groundtruth=truth,
+        scores=scores,
     )
-    return write_atomic(out_dir / "report.html", content)
+    files = [write_atomic(out_dir / "report.html", build_report(report))]
+    poses = run_poses(report)
+    picture = out_dir / "overview.png"
+    if poses is None:
+        picture.unlink(missing_ok=True)
+        return files
+    alignment = scores.final.alignment if scores is not None else None
+    return [*files, write_atomic(picture, overview(run, poses, alignment, "m" if poses.groundtruth is not None else "map units"))]
 
 
 def _read_groundtruth(path: Path | None) -> tuple[Trajectory | None, InputError | None]:
