@@ -67,7 +67,7 @@ def _paint_map(axes: Axes, poses: RunPoses, points: FloatArray, unit: str) -> No
     low, high = shown.min(axis=0), shown.max(axis=0)
     pad = _MARGIN * max(high[across] - low[across], high[up] - low[up], 1e-9)
     axes.set(xlim=(low[across] - pad, high[across] + pad), ylim=(low[up] - pad, high[up] + pad))
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
     axes.set(xlabel=f"{'xyz'[across]} / {unit}", ylabel=f"{'xyz'[up]} / {unit}")
     if poses.groundtruth is None and "xyz"[up] == "y":
         axes.invert_yaxis()
