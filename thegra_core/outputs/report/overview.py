@@ -36,7 +36,7 @@ def overview(run: Run, poses: RunPoses, alignment: Alignment | None, unit: str) 
             _paint_frame(left, snapshot)
         _paint_map(right, poses, points, unit)
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", metadata={"Software": None})
+        figure.savefig(buffer, format="png", bbox_inches="tight", metadata={"Software": None})
     return buffer.getvalue()
 
 
