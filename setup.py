@@ -19,6 +19,7 @@ REQUIRES = [
     "kornia>=0.9,<0.10; python_version >= '3.11'",
     "opencv-python-headless>=4.8",
     "scikit-image>=0.22",
+    "scipy>=1.11",
     "rosbags>=0.11",
     "mcap>=1.2",
     "poselib>=2.0.4",
@@ -30,7 +31,7 @@ REQUIRES = [
     "matplotlib>=3.8",
     "torch>=2.4",
 ]
-TEST = ["pytest>=8", "pytest-timeout>=2.2", "hypothesis>=6.100", "evo>=1.28", "pytransform3d>=3.5", "scipy>=1.11"]
+TEST = ["pytest>=8", "pytest-timeout>=2.2", "hypothesis>=6.100", "evo>=1.28", "pytransform3d>=3.5"]
 EXTRAS = {
     "test": TEST,
     "dev": [*TEST, "ruff>=0.5", "mypy>=1.10", "types-PyYAML", "import-linter>=2.1"],

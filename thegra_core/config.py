@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from thegra_core.errors import ConfigError
 
@@ -92,8 +92,69 @@ class PercentileStretch(Section):
     high: float = Field(99.0, gt=50, le=100, description="per cent")
 
 
+class KelvinWindow(Section):
+    """Linear map of a fixed range of temperatures to 8 bit, for radiometric streams."""
+
+    filter: Literal["kelvin_window"] = "kelvin_window"
+    low_k: float = Field(283.15, gt=0, description="K; 10 degrees Celsius")
+    high_k: float = Field(313.15, gt=0, description="K; 40 degrees Celsius")
+    kelvin_per_count: float = Field(0.01, gt=0, description="K; Lepton and Boson TLinear at high resolution: 0.01, at low: 0.1")
+    kelvin_at_zero: float = Field(0.0, description="K; temperature of count 0")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> KelvinWindow:
+        if not self.high_k > self.low_k:
+            raise ValueError(f"high_k {self.high_k:g} must lie above low_k {self.low_k:g}")
+        return self
+
+
+class DifferenceOfGaussians(Section):
+    """What lies between two scales (Wang et al. 2023 make edges of it)."""
+
+    filter: Literal["difference_of_gaussians"] = "difference_of_gaussians"
+    sigma_fine: float = Field(1.0, gt=0, le=50, description="px")
+    sigma_coarse: float = Field(4.0, gt=0, le=100, description="px")
+
+
+class Destripe(Section):
+    """Offset of each column and row taken off."""
+
+    filter: Literal["destripe"] = "destripe"
+    columns: bool = Field(True, description="repair columns: vertical stripes")
+    rows: bool = Field(False, description="repair rows: horizontal stripes")
+    width: int = Field(21, ge=3, le=255, description="px over which slow changes, which are the scene's, are told from stripes")
+
+
+class SvdDestripe(Section):
+    """Vertical stripes taken off as singular components, as Jiang et al. 2022 propose."""
+
+    filter: Literal["svd_destripe"] = "svd_destripe"
+    components: int = Field(1, ge=1, le=8, description="singular components taken for stripes")
+    width: int = Field(15, ge=3, le=255, description="px over which slow changes, which are the scene's, are told from stripes")
+
+
+class RepairDeadPixels(Section):
+    """Single pixels far from all their neighbours replaced."""
+
+    filter: Literal["repair_dead_pixels"] = "repair_dead_pixels"
+    threshold: float = Field(8.0, gt=0, description="times the usual difference of neighbours")
+
+
 Filter = Annotated[
-    ChambolleTv | HistogramClip | HistogramCdf | Clahe | Median | BandPass | Bilateral | PercentileStretch, Field(discriminator="filter")
+    ChambolleTv
+    | HistogramClip
+    | HistogramCdf
+    | Clahe
+    | Median
+    | BandPass
+    | Bilateral
+    | DifferenceOfGaussians
+    | PercentileStretch
+    | KelvinWindow
+    | Destripe
+    | SvdDestripe
+    | RepairDeadPixels,
+    Field(discriminator="filter"),
 ]
 
 
@@ -109,6 +170,7 @@ class PreprocessingConfig(Section):
     """Raw image to the 8-bit image the network sees; filters run in the order given."""
 
     filters: tuple[Filter, ...] = Field((ChambolleTv(), HistogramClip(), Median()), description="in order; paper: total variation, histogram, median")
+    window_s: float = Field(0.0, ge=0, description="seconds; time constant with which the 8-bit window of he_clip and stretch follows the frames; 0: each frame has its own, as in the paper")
     shutter: ShutterConfig = ShutterConfig()
 
 

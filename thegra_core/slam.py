@@ -18,7 +18,7 @@ from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.messages import Features, Frame, FrameRecord, Run, Shutter, ShutterState, Snapshot, TrackingResult, TrackingState
-from thegra_core.preprocessing.chain import build_chain
+from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
 from thegra_core.snapshots import SnapshotKeeper
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
@@ -55,7 +55,7 @@ class Slam:
 
     def __init__(self, camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None) -> None:
         self._camera = camera
-        self._chain = build_chain(config.preprocessing)
+        self._chain = Chain(config.preprocessing)
         self._shutter = ShutterDetector(config.preprocessing.shutter)
         self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
         self._matcher = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
@@ -85,6 +85,8 @@ class Slam:
             with self._timed("shutter"):
                 shutter = self._shutter.update(frame)
             self._note_closure(shutter)
+            if shutter.shutter is Shutter.JUST_OPENED:
+                self._chain.reset()
             output = self._tracking.hold(frame.stamp_ns, shutter.reason) if shutter.shutter is Shutter.CLOSED else self._see(frame)
         self._stage_ms["total"] = 1e3 * (time.perf_counter() - begin)
         result = replace(output.result, stage_ms=dict(self._stage_ms))
@@ -140,7 +142,7 @@ class Slam:
 
     def _see(self, frame: Frame) -> TrackingOutput:
         with self._timed("preprocessing"):
-            image = self._chain(frame.image)
+            image = self._chain(frame.image, frame.stamp_ns)
         with self._timed("extraction"):
             features = self._extractor.extract(image, frame.stamp_ns)
         reference = self._tracking.reference_features

@@ -16,15 +16,24 @@ from skimage.restoration import denoise_tv_chambolle
 from thegra_core import config as cfg
 from thegra_core.config import PreprocessingConfig
 from thegra_core.errors import ConfigError
-from thegra_core.preprocessing import chambolle, filters
-from thegra_core.preprocessing.chain import FILTERS, build_chain
+from thegra_core.preprocessing import chambolle, filters, repair, windows
+from thegra_core.preprocessing.chain import FILTERS, LIMITS, Chain
+from thegra_core.preprocessing.stability import SteadyWindow
 from thegra_core.sources.open import open_recording
 
 DTYPES = (np.uint8, np.uint16, np.float32)
-EVERY_FILTER = tuple(
-    section()
-    for section in (cfg.ChambolleTv, cfg.HistogramClip, cfg.HistogramCdf, cfg.Clahe, cfg.Median, cfg.BandPass, cfg.Bilateral, cfg.PercentileStretch)
-)
+SECTIONS = (
+    cfg.ChambolleTv, cfg.HistogramClip, cfg.HistogramCdf, cfg.Clahe, cfg.Median, cfg.BandPass, cfg.Bilateral, cfg.DifferenceOfGaussians,
+    cfg.PercentileStretch, cfg.KelvinWindow, cfg.Destripe, cfg.SvdDestripe, cfg.RepairDeadPixels,
+)  # fmt: skip
+EVERY_FILTER = tuple(section() for section in SECTIONS)
+ENDS_IN_8_BIT = tuple(section() for section in (cfg.HistogramClip, cfg.HistogramCdf, cfg.PercentileStretch))
+BEFORE_8_BIT = tuple(section for section in EVERY_FILTER if section.filter not in ("kelvin_window", "clahe", "band_pass"))
+"""Those that a constant offset of the counts passes through; CLAHE's bins are fixed, the band-pass takes the magnitude."""
+
+
+def apply(section, image):
+    return FILTERS[section.filter](image, **section.model_dump(exclude={"filter"}))
 
 
 def thermal(seed=0, height=64, width=80, noise=4.0):
@@ -58,23 +67,23 @@ def test_he_clip_is_the_published_one(seed, fold):
     image = thermal(seed, 512, 640)
     image[:3, :100] = 0  # missing pixels
     expected = he_clip_as_published(image, 10000, fold)
-    assert np.abs(filters.he_clip(image, fold=fold).astype(int) - expected).max() <= 1
+    assert np.abs(windows.he_clip(image, fold=fold).astype(int) - expected).max() <= 1
 
 
 def test_he_clip_of_floats_agrees_with_integers():
     image = thermal()
-    np.testing.assert_array_equal(filters.he_clip(image.astype(np.float32)), filters.he_clip(image))
+    np.testing.assert_array_equal(windows.he_clip(image.astype(np.float32)), windows.he_clip(image))
 
 
 def test_he_clip_does_not_depend_on_the_scale_of_floats():
     image = thermal().astype(np.float32)
-    difference = filters.he_clip(image / 16384).astype(int) - filters.he_clip(image)
+    difference = windows.he_clip(image / 16384).astype(int) - windows.he_clip(image)
     assert np.abs(difference).max() <= 1
 
 
 def test_he_clip_fold_mirrors_the_coldest():
     image = np.repeat(np.arange(100, 200, dtype=np.uint16), 10).reshape(20, 50)
-    clamped, folded = filters.he_clip(image, 0.1), filters.he_clip(image, 0.1, fold=True)
+    clamped, folded = windows.he_clip(image, 0.1), windows.he_clip(image, 0.1, fold=True)
     assert clamped[0, 0] == 0 < folded[0, 0]
     np.testing.assert_array_equal(clamped[image >= 109], folded[image >= 109])
 
@@ -155,12 +164,91 @@ def test_bilateral_is_opencvs():
 
 def test_stretch_maps_its_percentiles():
     image = np.arange(10000, dtype=np.uint16).reshape(100, 100)
-    out = filters.stretch(image, 1, 99)
+    out = windows.stretch(image, 1, 99)
     assert (int(out[0, 99]), int(out[1, 0]), int(out[99, 0])) == (0, 0, 255)
     assert abs(int(out[50, 0]) - 127) <= 2
 
 
-@given(hnp.arrays(np.uint16, hnp.array_shapes(min_dims=2, max_dims=2, min_side=4, max_side=24)), st.sampled_from([filters.he_clip, filters.he_cdf, filters.stretch]))
+def test_kelvin_window_by_hand():
+    image = np.array([[28315, 28815, 29815, 30315, 31315, 40000]], np.uint16)
+    np.testing.assert_array_equal(windows.kelvin_window(image, 283.15, 303.15, 0.01), [[0, 64, 191, 255, 255, 255]])
+    np.testing.assert_array_equal(windows.kelvin_window(np.array([[10.0, 30.0, 50.0]], np.float32), 283.15, 303.15, 1.0, 273.15), [[0, 255, 255]])
+    with pytest.raises(ConfigError, match="must lie above"):
+        cfg.load_config(overrides={"preprocessing.filters": [{"filter": "kelvin_window", "low_k": 300, "high_k": 290}]})
+
+
+def test_difference_of_gaussians_is_zero_mean_and_finds_its_scale():
+    y, x = np.mgrid[:64, :64]
+    blob = np.exp(-((x - 32.0) ** 2 + (y - 32.0) ** 2) / (2 * 2.0**2)).astype(np.float32)
+    out = filters.difference_of_gaussians(1000 * blob + 5000, 1.0, 4.0)
+    # a Gaussian of sigma 2 smoothed by s has height 4 / (4 + s^2)
+    assert out[32, 32] == pytest.approx(1000 * (4 / 5 - 4 / 20), rel=0.02)
+    assert out[0, 0] == pytest.approx(0, abs=0.1)
+
+
+# ---- repair of the sensor's faults -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_destripe_takes_off_stripes_and_leaves_the_scene(axis):
+    scene = thermal(noise=2.0, height=96, width=96).astype(np.float32)
+    stripes = np.random.default_rng(1).normal(0, 12, 96).astype(np.float32)
+    striped = scene + (stripes[None, :] if axis == 0 else stripes[:, None])
+    out = repair.destripe(striped, columns=axis == 0, rows=axis == 1)
+    assert np.sqrt(np.mean((out - scene) ** 2)) < 0.4 * stripes.std()
+    untouched = repair.destripe(scene, columns=axis == 0, rows=axis == 1)
+    assert np.sqrt(np.mean((untouched - scene) ** 2)) < 0.15 * stripes.std()
+    np.testing.assert_array_equal(repair.destripe(scene, columns=False), scene)
+
+
+def test_svd_destripe_takes_off_stripes_whose_gain_changes():
+    scene = thermal(noise=2.0, height=96, width=96).astype(np.float32)
+    stripes = np.random.default_rng(1).normal(0, 12, 96) * np.linspace(0.0, 2.0, 96)[:, None]
+    out = repair.svd_destripe((scene + stripes).astype(np.float32))
+    assert np.sqrt(np.mean((out - scene) ** 2)) < 0.7 * np.sqrt(np.mean(stripes**2))
+    untouched = repair.svd_destripe(scene)
+    assert np.sqrt(np.mean((untouched - scene) ** 2)) < 2.0
+    assert repair.svd_destripe(thermal()).dtype == np.uint16
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_dead_pixels_are_found_and_nothing_else(dtype):
+    image = thermal(noise=2.0).astype(dtype)
+    truth, places = image.copy(), [(0, 0), (5, 40), (30, 79), (63, 10), (40, 40)]
+    for n, (y, x) in enumerate(places):
+        image[y, x] = 0 if n % 2 else 16000
+    out = repair.repair_dead_pixels(image)
+    changed = set(zip(*map(np.ndarray.tolist, np.nonzero(out != image)), strict=True))
+    assert changed == set(places)
+    assert max(abs(float(out[p]) - float(truth[p])) for p in places) < 120  # at an edge of the scene either side is right
+    hot = thermal(noise=2.0)
+    hot[20:22, 20:22] = 9000
+    np.testing.assert_array_equal(repair.repair_dead_pixels(hot), hot, "a hot object of four pixels is no dead pixel")
+
+
+# ---- properties ------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("section", BEFORE_8_BIT, ids=lambda s: s.filter)
+@pytest.mark.parametrize("last", ENDS_IN_8_BIT, ids=lambda s: s.filter)
+def test_a_constant_offset_changes_nothing_in_the_end(section, last):
+    """A shutter closure or the core's drift lifts all counts alike."""
+    image = thermal(noise=3.0)
+    lifted = (image + 500).astype(np.uint16)
+    a, b = (apply(last, apply(section, i)).astype(int) for i in (image, lifted))
+    assert np.mean(np.abs(a - b) <= 1) > 0.999
+
+
+@pytest.mark.parametrize("section", [cfg.Destripe(), cfg.RepairDeadPixels(), cfg.KelvinWindow(low_k=1, high_k=3.55, kelvin_at_zero=1)], ids=lambda s: s.filter)
+def test_a_second_pass_changes_little(section):
+    image = (thermal(noise=1.0) - 2700).clip(0, 255).astype(np.uint8)
+    once = apply(section, image)
+    twice = apply(section, once)
+    first, second = (np.abs(a.astype(float) - b).mean() for a, b in ((once, image), (twice, once)))
+    assert second <= 0.5 * first or second < 0.6  # rounding to whole levels
+
+
+@given(hnp.arrays(np.uint16, hnp.array_shapes(min_dims=2, max_dims=2, min_side=4, max_side=24)), st.sampled_from([windows.he_clip, filters.he_cdf, windows.stretch, windows.kelvin_window]))
 def test_maps_to_8_bit_are_monotone(image, function):
     for values in (image, image.astype(np.float32), (image >> 8).astype(np.uint8)):
         out = function(values)
@@ -175,7 +263,7 @@ def test_filters_keep_shape_and_input(section, dtype, seed, height, width):
     image = np.random.default_rng(seed).integers(0, 256, (height, width)).astype(dtype)
     before = image.copy()
     image.setflags(write=False)
-    out = FILTERS[section.filter](image, **section.model_dump(exclude={"filter"}))
+    out = apply(section, image)
     assert out.shape == image.shape
     assert out.dtype in DTYPES
     assert np.all(np.isfinite(out))
@@ -189,8 +277,8 @@ def test_constant_images_pass_without_a_word(section, dtype, value):
     image = np.full((48, 40), value, dtype)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        out = FILTERS[section.filter](image, **section.model_dump(exclude={"filter"}))
-        chained = build_chain(PreprocessingConfig(filters=(section, cfg.HistogramClip())))(image)
+        out = apply(section, image)
+        chained = Chain(PreprocessingConfig(filters=(section, cfg.HistogramClip())))(image, 0)
     assert np.all(np.isfinite(out))
     if section.filter != "clahe":  # it spreads the clipped part of one bin over all
         assert float(np.ptp(out)) <= 1  # rounding in the bilateral filter
@@ -201,7 +289,7 @@ def test_chain_is_the_papers():
     image = thermal(height=512, width=640)
     denoised = denoise_tv_chambolle(image.astype(np.float64), weight=4.0)
     expected = cv2.medianBlur(he_clip_as_published(np.rint(denoised).astype(np.uint16), 10000, fold=False), 3)
-    out = build_chain(PreprocessingConfig())(image)
+    out = Chain(PreprocessingConfig())(image, 0)
     assert out.dtype == np.uint8
     difference = np.abs(out.astype(int) - expected)
     assert np.mean(difference <= 1) > 0.99  # the reference rounds to whole counts before its map, one count is about one grey level here
@@ -209,22 +297,22 @@ def test_chain_is_the_papers():
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_chain_takes_every_type(dtype):
-    out = build_chain(PreprocessingConfig())((thermal() >> 4).astype(dtype))
+    out = Chain(PreprocessingConfig())((thermal() >> 4).astype(dtype), 0)
     assert out.dtype == np.uint8
     assert out.std() > 30
 
 
 def test_chain_that_never_gives_8_bit():
     with pytest.raises(ConfigError, match=r"chambolle_tv -> median gives float32(.|\n)*he_clip, he_cdf, stretch"):
-        build_chain(PreprocessingConfig(filters=(cfg.ChambolleTv(), cfg.Median())))
+        Chain(PreprocessingConfig(filters=(cfg.ChambolleTv(), cfg.Median())))
 
 
 def test_chain_that_gives_8_bit_only_from_8_bit():
     for sections in ((cfg.Clahe(), cfg.Median()), ()):
-        chain = build_chain(PreprocessingConfig(filters=sections))
-        assert chain((thermal() >> 4).astype(np.uint8)).dtype == np.uint8
+        chain = Chain(PreprocessingConfig(filters=sections))
+        assert chain((thermal() >> 4).astype(np.uint8), 0).dtype == np.uint8
         with pytest.raises(ConfigError, match="gives uint16 from a uint16 image"):
-            chain(thermal())
+            chain(thermal(), 0)
 
 
 def test_unknown_filter_lists_the_known(tmp_path):
@@ -241,12 +329,65 @@ def test_every_configurable_filter_exists():
     assert {section.filter for section in EVERY_FILTER} == FILTERS.keys()
 
 
+# ---- a steady window --------------------------------------------------------------------------------------------------------------
+
+SECOND_NS = 1_000_000_000
+
+
+def test_steady_window_by_hand():
+    window = SteadyWindow(2.0)
+    assert window.update((100, 200), 0) == (100, 200)
+    share = 1 - np.exp(-0.1 / 2.0)
+    np.testing.assert_allclose(window.update((110, 230), SECOND_NS // 10), (100 + 10 * share, 200 + 30 * share))
+    _, high = window.update((100, 100_000), 2 * SECOND_NS // 10)  # as if at most one width away
+    assert high - (200 + 30 * share) == pytest.approx(share * (100 + 20 * share))
+    window.reset()
+    assert window.update((0, 1), 3 * SECOND_NS // 10) == (0, 1)
+    assert window.update((5, 6), 0) == (5, 6), "time was set back"
+
+
+@settings(max_examples=50)
+@given(st.lists(st.tuples(st.floats(0, 1e4), st.floats(1, 1e4)), min_size=2, max_size=30), st.floats(0.05, 10))
+def test_steady_window_stays_a_window_and_moves_slowly(windows_seen, seconds):
+    window, before = SteadyWindow(seconds), None
+    for index, (low, width) in enumerate(windows_seen):
+        limits = window.update((low, low + width), index * SECOND_NS // 10)
+        assert limits[1] > limits[0]
+        if before is not None:
+            most = (1 - np.exp(-0.1 / seconds)) * (before[1] - before[0]) * (1 + 1e-9)
+            assert max(abs(limits[0] - before[0]), abs(limits[1] - before[1])) <= most
+        before = limits
+
+
+@pytest.mark.parametrize("name", sorted(LIMITS))
+def test_a_stove_does_not_crush_the_rest(name):
+    section = next(s for s in EVERY_FILTER if s.filter == name)
+    cold, hot = thermal(noise=2.0), thermal(noise=2.0)
+    hot[:, :8] += 6000  # a tenth of the image, thirty times hotter than the scene is wide
+    alone, steady = Chain(PreprocessingConfig(filters=(section,))), Chain(PreprocessingConfig(filters=(section,), window_s=2.0))
+    contrast = {}
+    for chain in (alone, steady):
+        chain(cold, 0)
+        contrast[chain] = np.std(chain(hot, SECOND_NS // 10)[:, 10:])
+    usual = np.std(alone(cold, 0)[:, 10:])
+    assert contrast[alone] < 0.1 * usual and contrast[steady] > 0.85 * usual
+    steady.reset()
+    np.testing.assert_array_equal(steady(hot, SECOND_NS // 5), alone(hot, 0), "after a shutter closure the window is the frame's own")
+
+
+def test_without_a_steady_window_frames_do_not_know_each_other():
+    chain = Chain(PreprocessingConfig())
+    first = chain(thermal(0), 0)
+    chain(thermal(1) + 3000, 1)
+    np.testing.assert_array_equal(chain(thermal(0), 2), first)
+
+
 @pytest.mark.slow
 def test_real_frames(shared_data):
     for name in ("forest_f6_line1", "orchard_m2ea_drone", "sim_room_shutter", "forest_f0"):
         image = next(iter(open_recording(shared_data / name).frames())).image
         denoised = denoise_tv_chambolle(image.astype(np.float32), weight=4.0).astype(np.float32)
-        expected = cv2.medianBlur(filters.he_clip(denoised), 3)
-        out = build_chain(PreprocessingConfig())(image)
+        expected = cv2.medianBlur(windows.he_clip(denoised), 3)
+        out = Chain(PreprocessingConfig())(image, 0)
         assert np.mean(np.abs(out.astype(int) - expected) <= 1) >= 0.999, name
         assert out.std() > 35

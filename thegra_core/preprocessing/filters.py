@@ -1,6 +1,6 @@
-"""Image filters of the paper (Sec. III-B): pure functions from (H, W) uint8, uint16 or float32 to one of these.
+"""Image filters of the paper (Sec. III-B) and of the work it compares with: pure functions from (H, W) uint8, uint16 or float32 to one of these.
 
-Every function leaves its input alone and accepts constant images.
+Every function leaves its input alone and accepts constant images. The maps to 8 bit are in `windows`, the repair of the sensor's faults in `repair`.
 """
 
 from __future__ import annotations
@@ -30,22 +30,6 @@ def chambolle_tv(image: ImageArray, weight: float = 4.0, eps: float = 2e-4, max_
     if values.min() == values.max():
         return values
     return chambolle.denoise(values, weight, eps, max_iterations)
-
-
-def he_clip(image: ImageArray, tail_fraction: float = 10000 / (640 * 512), fold: bool = False) -> NDArray[np.uint8]:
-    """Two-tail clip and linear map to uint8: the paper's "histogram equalisation, cumulative pixel count 10000".
-
-    The limits are the values at which the cumulative histogram, from below and from above, reaches `tail_fraction` of the pixels.
-    Value 0 marks missing pixels in an integer image and does not count from below; in a float image every pixel counts.
-
-    Args:
-        image: Any of the three types.
-        tail_fraction: Share of the pixels beyond each limit.
-        fold: Mirror what is below the lower limit instead of clamping it, as the authors' script did.
-    """
-    count = max(1, round(tail_fraction * image.size))
-    low, high = _limits_float(image, count) if image.dtype == np.float32 else _limits_integer(image, count)
-    return _map_linear(image, low, high, fold)
 
 
 def he_cdf(image: ImageArray) -> NDArray[np.uint8]:
@@ -96,37 +80,12 @@ def bilateral(image: ImageArray, diameter: int = 4, sigma_color: float = 35.0, s
     return result
 
 
-def stretch(image: ImageArray, low: float = 1.0, high: float = 99.0) -> NDArray[np.uint8]:
-    """Linear map of the values between two percentiles to uint8."""
-    below, above = np.percentile(image, [low, high])
-    return _map_linear(image, float(below), float(above), fold=False)
-
-
-def _limits_integer(image: ImageArray, count: int) -> tuple[float, float]:
-    histogram = np.bincount(image.ravel(), minlength=2)
-    from_above = np.cumsum(histogram[::-1])
-    high = len(histogram) - 1 - int(np.searchsorted(from_above, min(count, image.size)))
-    histogram[0] = 0
-    from_below = np.cumsum(histogram)
-    low = int(np.searchsorted(from_below, min(count, max(int(from_below[-1]), 1))))
-    return float(min(low, len(histogram) - 1)), float(high)
-
-
-def _limits_float(image: ImageArray, count: int) -> tuple[float, float]:
-    count = min(count, image.size)
-    ordered = np.partition(image.ravel(), (count - 1, image.size - count))
-    return float(ordered[count - 1]), float(ordered[image.size - count])
-
-
-def _map_linear(image: ImageArray, low: float, high: float, fold: bool) -> NDArray[np.uint8]:
-    if not high > low:
-        return np.where(image > high, np.uint8(255), np.uint8(0)).astype(np.uint8)
-    scale = 255.0 / (high - low)
-    values = (image.astype(np.float32) - np.float32(low)) * np.float32(scale)
-    if fold:
-        np.abs(values, out=values)
-    np.rint(values, out=values)
-    return np.clip(values, 0, 255, out=values).astype(np.uint8)
+def difference_of_gaussians(image: ImageArray, sigma_fine: float = 1.0, sigma_coarse: float = 4.0) -> NDArray[np.float32]:
+    """What is between two scales: the image smoothed by `sigma_fine` less the image smoothed by `sigma_coarse`, both px; signed float32."""
+    values = image.astype(np.float32)
+    fine = cv2.GaussianBlur(values, (0, 0), sigma_fine, borderType=cv2.BORDER_REFLECT)
+    coarse = cv2.GaussianBlur(values, (0, 0), sigma_coarse, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(fine - coarse, dtype=np.float32)
 
 
 def _to_16_bit(image: ImageArray) -> NDArray[np.uint16]:
