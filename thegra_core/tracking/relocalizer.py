@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from thegra_core.config import ThegraConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.map.map import Map
 from thegra_core.messages import Features, Matches
-from thegra_core.tracking.tracker import Localization, localize
+from thegra_core.tracking.tracker import Localization, best_reference, localize
 
 
 def relocalize(
-    current: Map, features: Features, candidates: list[int], matcher: Matcher, config: ThegraConfig, min_inliers: int
+    current: Map, features: Features, candidates: list[int], matcher: Matcher, config: ThegraConfig, min_inliers: int, known: Mapping[int, Matches] | None = None
 ) -> tuple[Localization, int, Matches] | None:
-    """The first candidate keyframe in which the frame is placed with at least `min_inliers`; also its id and the matches to it."""
-    for keyframe_id in candidates:
-        matches = matcher.match(features, current.keyframes[keyframe_id].features)
-        found = localize(current, features, keyframe_id, matches, None, config)
-        if isinstance(found, Localization) and found.inliers >= min_inliers:
-            return found, keyframe_id, matches
-    return None
+    """Place the frame by its matches to all candidate keyframes together; also the keyframe that shares most with it and the matches to that one.
+
+    One keyframe alone may share too little with a frame that comes back after a gap; what several share adds up. `known` matches are not made again.
+    """
+    matched = dict(known or {})
+    open_ids = [i for i in candidates if i not in matched]
+    matched.update(zip(open_ids, matcher.match_many(features, [current.keyframes[i].features for i in open_ids]), strict=True))
+    if not matched:
+        return None
+    reference_id = max(matched, key=lambda i: (len(matched[i]), i))
+    found = localize(current, features, reference_id, matched, None, config)
+    if isinstance(found, str) or found.inliers < min_inliers:
+        return None
+    reference_id = best_reference(current, found.landmark_ids, list(matched))
+    return found, reference_id, matched[reference_id]
 
 
 def last_keyframes(current: Map, reference_id: int, count: int) -> list[int]:

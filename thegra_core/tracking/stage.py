@@ -117,9 +117,9 @@ class TrackingStage:
             return self._start(features, matches)
         if matches is None or matches.reference_stamp_ns != place.reference.stamp_ns:
             matches = self._matcher.match(features, place.reference)
-        found = localize(place.map, features, place.reference_id, matches, place.predict(features.stamp_ns), self._config)
+        found = localize(place.map, features, place.reference_id, {place.reference_id: matches}, place.predict(features.stamp_ns), self._config)
         if isinstance(found, str):
-            return self._recover(place, features, found)
+            return self._recover(place, features, matches, found)
         return self._accept(place, features, found, matches)
 
     def hold(self, stamp_ns: int, reason: str) -> TrackingOutput:
@@ -244,7 +244,7 @@ class TrackingStage:
         self._next_keyframe_id += 1
         return keyframe
 
-    def _recover(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
+    def _recover(self, place: _Place, features: Features, matches: Matches, reason: str) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then a new map beside the old one."""
         if place.probation:
             dropped = self._drop()
@@ -254,7 +254,7 @@ class TrackingStage:
         settings = self._config.relocalization
         candidates = last_keyframes(place.map, place.reference_id, settings.keyframes)
         least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
-        found = relocalize(place.map, features, candidates, self._matcher, self._config, least)
+        found = relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
         if found is not None:
             place.reference_id = found[1]
             return self._accept(place, features, found[0], found[2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from thegra_core.optimization.weighting import gate_weights, observation_weights
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 RANSAC_THRESHOLD_PX = 4.0
 """Inlier threshold of the first pose: wide, since the map's points carry their own error; refinement gates at the chi-square limit."""
@@ -64,14 +66,14 @@ def localize(
     current: Map,
     features: Features,
     reference_id: int,
-    matches: Matches,
+    matched: Mapping[int, Matches],
     predicted_world_from_camera: FloatArray | None,
     config: ThegraConfig,
 ) -> Localization | str:
     """Place a frame in the map; a string says why that failed.
 
-    Stage 1: learned matches to the reference keyframe inherit its landmarks and give a pose by RANSAC and motion-only bundle adjustment; where
-    they are too few the constant-velocity prediction takes its place. Stage 2: the local map's visible landmarks are projected and looked for by
+    Stage 1: learned matches `matched` to keyframes, while tracking to the reference keyframe alone, inherit the keyframes' landmarks and give a pose by
+    RANSAC and motion-only bundle adjustment; where they are too few the constant-velocity prediction takes its place. Stage 2: the local map's visible landmarks are projected and looked for by
     descriptor, and a second motion-only bundle adjustment uses both.
     """
     settings = config.tracking
@@ -79,7 +81,8 @@ def localize(
     landmark_ids = np.full(len(features), NO_LANDMARK, dtype=np.int64)
     radius = settings.search_radius_px
 
-    first, reason = _pose_from_reference(current, view, reference_id, matches, landmark_ids, config)
+    matches = sum(map(len, matched.values()))
+    first, reason = _pose_from_matches(current, view, matched, landmark_ids, config)
     if first is not None:
         camera_from_world = first
     elif predicted_world_from_camera is not None:
@@ -93,29 +96,47 @@ def localize(
     inliers = int((landmark_ids != NO_LANDMARK).sum())
     if estimate is None or inliers < settings.min_inliers:
         return f"{inliers} of at least {settings.min_inliers} landmarks found" + (f" ({reason})" if reason else "")
-    return Localization(estimate.camera_from_world, estimate.covariance, landmark_ids, np.union1d(visible.ids, landmark_ids[landmark_ids >= 0]), len(matches))
+    return Localization(estimate.camera_from_world, estimate.covariance, landmark_ids, np.union1d(visible.ids, landmark_ids[landmark_ids >= 0]), matches)
 
 
-def _pose_from_reference(
-    current: Map, view: FrameView, reference_id: int, matches: Matches, landmark_ids: IntArray, config: ThegraConfig
+def _pose_from_matches(
+    current: Map, view: FrameView, matched: Mapping[int, Matches], landmark_ids: IntArray, config: ThegraConfig
 ) -> tuple[FloatArray | None, str]:
     """Stage 1; fills `landmark_ids` with its inliers. Without a pose the second value says why."""
     settings = config.tracking
-    reference = current.keyframes[reference_id]
-    ids = reference.landmark_ids[matches.indices[:, 1]]
-    rows = current.landmarks.rows(ids)
-    use = (rows >= 0) & view.defined[matches.indices[:, 0]]
-    if use.sum() < settings.min_reference_matches:
-        return None, f"{len(matches)} matches to the reference keyframe, {int(use.sum())} of them with landmarks"
-    keypoints, points = matches.indices[use, 0].astype(np.int64), current.landmarks.points_world[rows[use]]
+    keypoints, ids = inherited_landmarks(current, matched, view.defined)
+    where = "the reference keyframe" if len(matched) == 1 else f"{len(matched)} keyframes"
+    if len(ids) < settings.min_reference_matches:
+        return None, f"{sum(map(len, matched.values()))} matches to {where}, {len(ids)} of them with landmarks"
+    points = current.landmarks.points_world[current.landmarks.rows(ids)]
     pose, found = estimate_pose(points, view.normalized[keypoints], view.focal, RANSAC_THRESHOLD_PX, config.seed)
     if found < settings.min_reference_inliers:
-        return None, f"{found} inliers of {int(use.sum())} matches to the reference keyframe"
+        return None, f"{found} inliers of {len(ids)} matches to {where}"
     estimate = view.refine(pose, points, keypoints, settings.chi2_px2)
     if estimate.inliers.sum() < settings.min_reference_inliers:
-        return None, f"{int(estimate.inliers.sum())} inliers of {int(use.sum())} matches to the reference keyframe"
-    landmark_ids[keypoints[estimate.inliers]] = ids[use][estimate.inliers]
+        return None, f"{int(estimate.inliers.sum())} inliers of {len(ids)} matches to {where}"
+    landmark_ids[keypoints[estimate.inliers]] = ids[estimate.inliers]
     return estimate.camera_from_world, ""
+
+
+def inherited_landmarks(current: Map, matched: Mapping[int, Matches], defined: BoolArray) -> tuple[IntArray, IntArray]:
+    """Keypoints (M,) of a frame and the landmarks (M,) that they inherit by its matches to keyframes, one to one, the most confident match first.
+
+    defined (N,) bool: the frame's keypoints that may be used.
+    """
+    keypoints, ids, confidence = [], [], []
+    for keyframe_id, matches in matched.items():
+        inherited = current.keyframes[keyframe_id].landmark_ids[matches.indices[:, 1]]
+        use = (current.landmarks.rows(inherited) >= 0) & defined[matches.indices[:, 0]]
+        keypoints.append(matches.indices[use, 0].astype(np.int64))
+        ids.append(inherited[use])
+        confidence.append(matches.confidence[use])
+    all_keypoints, all_ids = np.concatenate(keypoints), np.concatenate(ids)
+    order = np.argsort(-np.concatenate(confidence), kind="stable")
+    for key in (all_keypoints, all_ids):
+        order = order[np.sort(np.unique(key[order], return_index=True)[1])]
+    order = order[np.argsort(all_keypoints[order], kind="stable")]
+    return all_keypoints[order], all_ids[order]
 
 
 def _refine_with_local_map(
