@@ -228,6 +228,8 @@ class TrackingConfig(Section):
     min_reference_matches: int = Field(15, ge=4, description="matches that see a landmark; ORB-SLAM3: 15")
     min_reference_inliers: int = Field(10, ge=4, description="ORB-SLAM3: 10")
     min_inliers: int = Field(25, ge=6, description="inliers after the second stage; ORB-SLAM3: 30, thermal frames have fewer points")
+    min_sparse_landmarks: int = Field(8, ge=4, description="landmarks that suffice where matches without landmarks agree with the pose: they give what those leave open, the scale")
+    min_sparse_matches: int = Field(50, ge=10, description="matches without landmarks, and at least half of all, that must agree with such a pose")
     local_keyframes: int = Field(20, ge=1, description="keyframes whose landmarks are projected")
     max_view_angle_deg: float = Field(60.0, gt=0, lt=180, description="degrees; paper: 60")
     depth_margin: float = Field(2.0, ge=1, description="a landmark is looked for between its least observed distance over this and its largest times this; the detectors have no octaves")

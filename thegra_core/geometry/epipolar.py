@@ -28,11 +28,16 @@ def essential(camera1_from_camera0: FloatArray) -> FloatArray:
 
 def sampson_errors(essential_matrix: FloatArray, normalized0: FloatArray, normalized1: FloatArray) -> FloatArray:
     """First-order distances (N,) to the epipolar constraint, on the plane z = 1 (Hartley and Zisserman 2004, Eq. 11.9)."""
+    return np.abs(signed_sampson_errors(essential_matrix, normalized0, normalized1))
+
+
+def signed_sampson_errors(essential_matrix: FloatArray, normalized0: FloatArray, normalized1: FloatArray) -> FloatArray:
+    """`sampson_errors` with the sign of the algebraic error: smooth through zero, for least squares."""
     x0, x1 = homogeneous(normalized0), homogeneous(normalized1)
     line1, line0 = x0 @ essential_matrix.T, x1 @ essential_matrix
     algebraic = np.einsum("ni,ni->n", x1, line1)
     scale = np.sqrt((line1[:, :2] ** 2).sum(axis=1) + (line0[:, :2] ** 2).sum(axis=1))
-    return np.asarray(np.abs(algebraic) / np.maximum(scale, 1e-15))
+    return np.asarray(algebraic / np.maximum(scale, 1e-15))
 
 
 def epipolar_distances(camera1_from_camera0: FloatArray, normalized0: FloatArray, normalized1: FloatArray) -> FloatArray:

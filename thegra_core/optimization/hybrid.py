@@ -1,0 +1,180 @@
+"""The pose of a camera that sees few landmarks but shares many matches with posed cameras: landmarks give the scale, the matches the rest.
+
+A match whose point was never triangulated still says that the point lies on a line in the image, one equation on the pose. Where a view has turned to a
+part of the scene that the map hardly holds, such matches are most of what is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from thegra_core.geometry import epipolar, poses
+from thegra_core.optimization.pose import pose_jacobian
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+ROUNDS, STEPS = 4, 10
+SAMPLES = 100
+"""Draws of three landmarks; with half of them wrong, one draw in eight is right."""
+EPIPOLAR_CHI2 = 3.841
+"""95 % of chi-square with the one degree of freedom that a match without a landmark has."""
+_DELTA = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkView:
+    """Landmarks points_world (N, 3) seen at normalized (N, 2), with weights (N,) in 1/px^2 and gates (N,), factors of squared pixel residuals."""
+
+    points_world: FloatArray
+    normalized: FloatArray
+    weights: FloatArray
+    gates: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class SharedView:
+    """Matches with a posed camera: its camera_from_world (4, 4), normalized there and here (M, 2), weights (M,) in 1/px^2 and gates (M,)."""
+
+    camera_from_world: FloatArray
+    there: FloatArray
+    here: FloatArray
+    weights: FloatArray
+    gates: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class HybridEstimate:
+    """camera_from_world (4, 4); inliers (N,) bool of the landmarks; agreeing, per shared view (M,) bool of its matches; covariance (6, 6) as `PoseEstimate`'s."""
+
+    camera_from_world: FloatArray
+    inliers: BoolArray
+    agreeing: tuple[BoolArray, ...]
+    covariance: FloatArray
+
+    @property
+    def agreeing_matches(self) -> int:
+        return sum(int(a.sum()) for a in self.agreeing)
+
+
+def estimate_hybrid_pose(landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, threshold_px: float, seed: int) -> FloatArray | None:
+    """camera_from_world (4, 4) without a starting pose: the one from three landmarks (P3P, drawn `SAMPLES` times) that most landmarks and matches
+    agree with, each as far as its error is below `threshold_px`. None with fewer than four landmarks or if no three give a pose.
+
+    PoseLib has a RANSAC for this (`estimate_hybrid_pose`), whose results differ from call to call.
+    """
+    count = len(landmarks.points_world)
+    if count < 4:
+        return None
+    rng = np.random.default_rng(seed)
+    bearings = epipolar.homogeneous(landmarks.normalized)
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    best, best_score = None, 0.0
+    for _ in range(SAMPLES):
+        three = rng.choice(count, 3, replace=False)
+        for found in poselib.p3p(list(bearings[three]), list(landmarks.points_world[three])):
+            pose = poses.transform(found.R, found.t)
+            score = _agreement(pose, landmarks, shared, focal, threshold_px) if np.all(np.isfinite(pose)) else 0.0
+            if score > best_score:
+                best, best_score = pose, score
+    return best
+
+
+def _agreement(pose: FloatArray, landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, threshold_px: float) -> float:
+    """Truncated quadratic score: 1 for each observation without error, 0 beyond the threshold."""
+    squared = [_squared_errors(pose, landmarks, focal), *((focal * _sampson(pose, view)) ** 2 for view in shared)]
+    return float(np.maximum(1.0 - np.concatenate(squared) / threshold_px**2, 0.0).sum())
+
+
+def _squared_errors(pose: FloatArray, landmarks: LandmarkView, focal: float) -> FloatArray:
+    """Squared reprojection errors (N,) in px^2, inf behind the camera."""
+    points = poses.apply(pose, landmarks.points_world)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squared = focal**2 * ((points[:, :2] / points[:, 2:] - landmarks.normalized) ** 2).sum(axis=1)
+    return np.where(points[:, 2] > 1e-9, squared, np.inf)
+
+
+def refine_hybrid_pose(camera_from_world: FloatArray, landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, chi2: float) -> HybridEstimate:
+    """Least robust weighted error of landmarks (reprojection) and matches (Sampson's distance) over one pose, both in px.
+
+    Rounds and gates as `refine_pose`: after each, what lies beyond its gate sits out the next; the Huber kernel is off in the last.
+    """
+    pose = camera_from_world
+    seen, agreeing = _gate(pose, landmarks, shared, focal, 16.0 * chi2)
+    hessian = np.eye(6)
+    for round_index in range(ROUNDS):
+        huber = np.sqrt(chi2) if round_index < ROUNDS - 1 else np.inf
+        pose, hessian = _gauss_newton(pose, _seen_part(landmarks, seen), [_shared_part(v, a) for v, a in zip(shared, agreeing, strict=True)], focal, huber)
+        seen, agreeing = _gate(pose, landmarks, shared, focal, chi2)
+        if seen.sum() < 2:
+            break
+    used = [_shared_part(v, a) for v, a in zip(shared, agreeing, strict=True)]
+    residuals, weights, _ = _system(pose, _seen_part(landmarks, seen), used, focal)
+    variance = float((weights * residuals**2).sum() / max(len(residuals) - 6, 1)) if len(residuals) else 1.0
+    covariance = max(variance, 1e-12) * np.linalg.pinv(hessian, hermitian=True)
+    return HybridEstimate(pose, seen, tuple(agreeing), np.asarray(covariance, dtype=np.float64))
+
+
+def _gate(
+    pose: FloatArray, landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, chi2: float
+) -> tuple[BoolArray, list[BoolArray]]:
+    """Landmarks and matches within `chi2` px^2 of the pose; matches by the share of it that their one degree of freedom has."""
+    seen = landmarks.gates * _squared_errors(pose, landmarks, focal) < chi2
+    limit = chi2 * EPIPOLAR_CHI2 / 5.991
+    return seen, [view.gates * (focal * _sampson(pose, view)) ** 2 < limit for view in shared]
+
+
+def _gauss_newton(pose: FloatArray, landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, huber: float) -> tuple[FloatArray, FloatArray]:
+    hessian = np.eye(6)
+    for _ in range(STEPS):
+        residuals, weights, jacobian = _system(pose, landmarks, shared, focal)
+        if len(residuals) < 6:
+            break
+        robust = weights * np.minimum(1.0, huber / np.maximum(np.sqrt(weights) * np.abs(residuals), 1e-12))
+        hessian = jacobian.T @ (robust[:, None] * jacobian)
+        step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), jacobian.T @ (robust * residuals))
+        pose = _moved(pose, step)
+        if float(np.abs(step).max()) < 1e-8:
+            break
+    return pose, hessian
+
+
+def _system(
+    pose: FloatArray, landmarks: LandmarkView, shared: Sequence[SharedView], focal: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals (R,) px, weights (R,) and Jacobian (R, 6) by a left perturbation of the pose; landmarks behind the camera are left out."""
+    points = poses.apply(pose, landmarks.points_world)
+    front = points[:, 2] > 1e-9
+    points = points[front]
+    parts = [(
+        focal * (points[:, :2] / points[:, 2:] - landmarks.normalized[front]).reshape(-1),
+        np.repeat(landmarks.weights[front], 2),
+        focal * pose_jacobian(points).reshape(-1, 6),
+    )]  # fmt: skip
+    for view in shared:
+        center = _sampson(pose, view)
+        columns = [(_sampson(_moved(pose, d), view) - _sampson(_moved(pose, -d), view)) / (2 * _DELTA) for d in _DELTA * np.eye(6)]
+        parts.append((focal * center, view.weights, focal * np.stack(columns, axis=1)))
+    residuals, weights, jacobian = (np.concatenate(x) for x in zip(*parts, strict=True))
+    return residuals, weights, jacobian
+
+
+def _sampson(pose: FloatArray, view: SharedView) -> FloatArray:
+    """Signed Sampson distances (M,) on the plane z = 1."""
+    return epipolar.signed_sampson_errors(epipolar.essential(pose @ poses.inverse(view.camera_from_world)), view.there, view.here)
+
+
+def _moved(pose: FloatArray, step: FloatArray) -> FloatArray:
+    return poses.transform(poses.so3_exp(step[:3]), step[3:]) @ pose
+
+
+def _seen_part(view: LandmarkView, keep: BoolArray) -> LandmarkView:
+    return LandmarkView(view.points_world[keep], view.normalized[keep], view.weights[keep], view.gates[keep])
+
+
+def _shared_part(view: SharedView, keep: BoolArray) -> SharedView:
+    return SharedView(view.camera_from_world, view.there[keep], view.here[keep], view.weights[keep], view.gates[keep])
