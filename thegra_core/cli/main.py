@@ -150,6 +150,31 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
     doctor_command(as_json)
 
 
+@app.command()
+def study(
+    recordings: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Recordings as `thegra run` takes them.")],
+    interval: Annotated[float, typer.Option(metavar="SECONDS", min=0.0, help="Time between the frames of a pair; the next frame where frames are further apart.")],
+    pairs: Annotated[int, typer.Option(min=1, help="Pairs of each recording at the most.")] = 20,
+    chain: Annotated[list[str] | None, typer.Option(help="Filter chain; repeatable. Default: all.")] = None,
+    front_end: Annotated[list[str] | None, typer.Option(help="Detector and matcher; repeatable. The first one is used to compare chains. Default: all, SuperPoint + LightGlue first.")] = None,
+    cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for table, CSV and pictures. Default: runs/study_TIME.")] = None,
+) -> None:
+    """Compare filters and front ends by the matches between frames a fixed time apart: the paper's experiment.
+
+    Example: `thegra study flight.bag --interval 0.5 --front-end "ALIKED + LightGlue" --out runs/study`
+
+    Writes study.csv, study.md, and pictures.
+    """
+    from datetime import datetime, timezone
+
+    from thegra_core.cli.study import plan_study
+    from thegra_core.cli.study import study as run_study
+
+    folder = out or Path("runs") / f"study_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"
+    run_study(plan_study(recordings, interval, pairs, chain, front_end, cache, folder))
+
+
 app.add_typer(weights_app, name="weights")
 app.add_typer(benchmark_app, name="benchmark")
 
