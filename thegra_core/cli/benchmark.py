@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from thegra_core.errors import ConfigError
+from thegra_core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from thegra_core.evaluation.benchmark.slam import PlannedRun, RunResult
+    from thegra_core.messages import ImageArray
 
 app = typer.Typer(no_args_is_help=True, help="Measure the system over recordings.")
 SOME_FAILED = 1
@@ -76,6 +77,61 @@ def slam(
     _show(logic.report(plan, results, others), plan.out, as_json)
     if any(result.error is not None for result in results):
         raise typer.Exit(SOME_FAILED)
+
+
+@app.command("preprocessing")
+def preprocessing(
+    recordings: Annotated[list[Path] | None, typer.Argument(metavar="[INPUT...]", help="Recordings to take frames from. Default: a simulated 640x512 scene.")] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Frames of each recording, evenly spread.")] = 3,
+    repeats: Annotated[int, typer.Option(min=1, help="Times each frame is processed.")] = 5,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Time the filters and the paper's chain on one thread, beside scikit-image and OpenCV.
+
+    Example: `thegra benchmark preprocessing flight.bag --frames 5`
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from thegra_core.evaluation.benchmark import preprocessing as logic
+
+    console = Console(stderr=True)
+    with console.status("reading frames") as status:
+        images = _frames_of(recordings or [], frames)
+        content = logic.benchmark(images, repeats, status.update)
+    if as_json:
+        print(json.dumps(content, indent=2))
+        return
+    width, height = content["image_size"]
+    table = Table(caption=f"Medians over {content['frames']} frames of {width}x{height}, one thread. Ratio: reference over ours.", caption_justify="left")
+    for name in ("filter", "ms", "reference ms", "ratio"):
+        table.add_column(name, justify="left" if name == "filter" else "right")
+    for name, figures in [*content["filters"].items(), ("the paper's chain", content["chain"])]:
+        reference = figures["reference_ms"]
+        table.add_row(name, f"{figures['ms']:.2f}", f"{reference:.2f}" if reference else "–", f"{reference / figures['ms']:.1f}" if reference else "–")
+    Console().print(table)
+    print(f"the paper's chain: {content['chain']['within_one_level_pct']:.3f} % of the pixels within one grey level of the reference")
+
+
+def _frames_of(recordings: Sequence[Path], count: int) -> list[ImageArray]:
+    import numpy as np
+
+    from thegra_core.simulation.demo import thermal_camera
+    from thegra_core.simulation.paths import PATHS
+    from thegra_core.simulation.renderer import pixel_rays, render
+    from thegra_core.simulation.scene import SCENES
+    from thegra_core.sources.open import open_recording
+
+    if not recordings:
+        rays, rng = pixel_rays(thermal_camera((640, 512))), np.random.default_rng(0)
+        return [render(SCENES["room"](0), rays, PATHS["room"].world_from_camera(float(i)), 3.0, rng).image for i in range(count)]
+    chosen: list[ImageArray] = []
+    for path in recordings:
+        images = [frame.image for frame in open_recording(path).frames()]
+        chosen += [images[i] for i in np.unique(np.linspace(0, len(images) - 1, count).round().astype(int))] if images else []
+    if not chosen:
+        raise InputError("the recordings hold no readable image; what they hold is told by: thegra info INPUT")
+    return chosen
 
 
 def _limits(texts: list[str]) -> dict[str, int]:
