@@ -131,10 +131,19 @@ def test_the_other_side_joins(editor: MapEditor, seeing: int) -> None:
     assert editor.observers[landmark] == {0: 2, 1: 2, 2: 2}
 
 
-def test_a_landmark_that_does_not_reproject_is_not_joined_and_its_match_makes_no_point(editor: MapEditor) -> None:
+def test_a_landmark_whose_depth_is_still_wrong_is_joined_at_the_point_that_all_agree_on(editor: MapEditor) -> None:
     landmark = known(editor, 2, [0, 2], offset=0.1)  # 7 px off
     assert expand(editor, 1, 0, ALL, CONFIG) == 3
-    assert editor.observers[landmark] == {0: 2, 2: 2}
+    assert editor.observers[landmark] == {0: 2, 1: 2, 2: 2}
+    np.testing.assert_allclose(editor.map.landmarks.points_world[editor.map.landmarks.rows(np.array([landmark]))[0]], TRUTH[2], atol=1e-3)
+
+
+def test_a_landmark_that_no_point_reconciles_with_its_match_is_not_joined_and_the_match_makes_no_point(editor: MapEditor) -> None:
+    landmark = int(editor.add_landmarks(TRUTH[2:3] + [0, 0.1, 0], 0)[0])
+    editor.observe(landmark, 0, 2)
+    editor.observe(landmark, 2, 3)  # another point's keypoint
+    assert expand(editor, 1, 0, ALL, CONFIG) <= 3
+    assert editor.observers[landmark] == {0: 2, 2: 3}
     assert editor.map.keyframes[1].landmark_ids[2] == NO_LANDMARK
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from thegra_core.geometry import poses
-from thegra_core.geometry.triangulation import depths, parallax, reprojection_errors, triangulate, triangulate_views
+from thegra_core.geometry.triangulation import depths, parallax, refine_points, reprojection_errors, triangulate, triangulate_views
 
 
 def test_a_point_by_hand() -> None:
@@ -68,3 +68,39 @@ def test_reprojection_behind_the_camera_is_infinitely_wrong() -> None:
     errors = reprojection_errors(np.eye(4), np.array([[0.0, 0, -1], [0, 0, 0], [0, 0, 1]]), np.zeros((3, 2)))
     np.testing.assert_array_equal(errors, [np.inf, np.inf, 0.0])
     assert reprojection_errors(np.eye(4), np.array([[0.0, 0, 1]]), np.full((1, 2), np.nan)) != pytest.approx(0.0)
+
+
+def test_refined_points_are_those_of_least_reprojection_error() -> None:
+    """Points seen in three to five views with noise: exact without noise, and with it no worse than a general optimiser's."""
+    from scipy.optimize import least_squares
+
+    rng = np.random.default_rng(2)
+    true = np.stack([rng.uniform(-1, 1, 30), rng.uniform(-1, 1, 30), rng.uniform(3, 8, 30)], axis=1)
+    cameras = np.stack([poses.inverse(poses.transform(poses.so3_exp(rng.normal(0, 0.1, 3)), rng.normal(0, 0.5, 3))) for _ in range(5)])
+    point_index = np.concatenate([np.repeat(i, 3 + i % 3) for i in range(30)])
+    views = np.concatenate([np.arange(3 + i % 3) for i in range(30)])
+    seen = np.einsum("mij,mj->mi", cameras[views][:, :3, :3], true[point_index]) + cameras[views][:, :3, 3]
+    exact = seen[:, :2] / seen[:, 2:]
+    start = true + rng.normal(0, 0.2, true.shape)
+    points, errors = refine_points(cameras[views], exact, point_index, start, steps=8)
+    np.testing.assert_allclose(points, true, atol=1e-6)
+    assert errors.max() < 1e-6
+    noisy = exact + rng.normal(0, 0.002, exact.shape)
+    points, errors = refine_points(cameras[views], noisy, point_index, start, steps=8)
+    for i in range(0, 30, 7):
+        mine = point_index == i
+
+        def residual(x: np.ndarray, mine: np.ndarray = mine) -> np.ndarray:
+            p = np.einsum("mij,j->mi", cameras[views[mine]][:, :3, :3], x) + cameras[views[mine]][:, :3, 3]
+            return (p[:, :2] / p[:, 2:] - noisy[mine]).ravel()
+
+        best = least_squares(residual, true[i], xtol=1e-12)
+        np.testing.assert_allclose(points[i], best.x, atol=1e-4)
+        assert (errors[mine] ** 2).sum() == pytest.approx(2 * best.cost, rel=1e-4)
+
+
+def test_a_point_behind_a_camera_stays_and_has_infinite_error() -> None:
+    cameras = np.stack([np.eye(4), np.eye(4)])
+    points, errors = refine_points(cameras, np.zeros((2, 2)), np.array([0, 0]), np.array([[0.0, 0.0, -2.0]]))
+    np.testing.assert_array_equal(points, [[0.0, 0.0, -2.0]])
+    assert np.isinf(errors).all()

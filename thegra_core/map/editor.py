@@ -129,6 +129,11 @@ class MapEditor:
         self.map.landmarks.points_world[rows[rows >= 0]] = points_world[rows >= 0]
         self._landmarks.update(landmark_ids[rows >= 0].tolist())
 
+    def place(self, landmark: int, point_world: FloatArray) -> None:
+        """Set the position (3,) of one landmark."""
+        self.map.landmarks.points_world[self.map.landmarks.rows(np.array([landmark]))] = point_world
+        self._landmarks.add(landmark)
+
     @property
     def next_landmark(self) -> int:
         """The id that the next new landmark will get."""

@@ -6,13 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import MappingConfig
-from thegra_core.geometry import epipolar, poses, triangulation
+from thegra_core.geometry import epipolar, triangulation
 from thegra_core.map.editor import MapEditor
 from thegra_core.map.map import MapKeyframe
 from thegra_core.messages import NO_LANDMARK, Matches
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+WORST_OF_MANY = 1.5
+"""The worst of a landmark's observations may lie this many times further off than a single one: with half a dozen, one in four landmarks has such a one."""
 IntArray = NDArray[np.int64]
 
 
@@ -63,22 +65,69 @@ def accept_points(
 
 
 def _join(editor: MapEditor, seeing: MapKeyframe, other: MapKeyframe, seeing_index: IntArray, other_index: IntArray, config: MappingConfig) -> None:
-    """Landmarks that `seeing` observes and whose match in `other` reprojects: observed by `other` too, or fused with what it observes there."""
+    """Landmarks that `seeing` observes are observed by their matches in `other` too, or fused with what those observe.
+
+    Where the landmark reprojects it is joined as it is. A landmark of two near views hardly has a depth yet and may reproject far off although the match is
+    right: where the match fits the epipolar geometry the landmark is triangulated anew from all that would observe it, and joined if that fits all of them.
+    """
     ids = seeing.landmark_ids[seeing_index]
     rows = editor.map.landmarks.rows(ids)
-    with_landmark = np.flatnonzero(rows >= 0)
-    if len(with_landmark) == 0:
+    candidate = np.flatnonzero((rows >= 0) & (ids != other.landmark_ids[other_index]))
+    if len(candidate) == 0:
         return
-    points = editor.map.landmarks.points_world[rows[with_landmark]]
-    error = editor.map.camera.focal * triangulation.reprojection_errors(
-        poses.inverse(other.world_from_camera), points, other.normalized[other_index[with_landmark]]
-    )
-    for index in with_landmark[error < config.max_reprojection_px].tolist():
-        landmark, feature = int(ids[index]), int(other_index[index])
+    points = editor.map.landmarks.points_world[rows[candidate]]
+    focal = editor.map.camera.focal
+    error = focal * triangulation.reprojection_errors(other.camera_from_world, points, other.normalized[other_index[candidate]])
+    fits = error < config.max_reprojection_px
+    for index in candidate[fits].tolist():
+        _merge(editor, int(ids[index]), other, int(other_index[index]))
+    rest = candidate[~fits]
+    other_from_seeing = other.camera_from_world @ seeing.world_from_camera
+    essential = epipolar.essential(other_from_seeing)
+    near = focal * epipolar.sampson_errors(essential, seeing.normalized[seeing_index[rest]], other.normalized[other_index[rest]]) < config.epipolar_px
+    _join_anew(editor, ids[rest[near]].tolist(), other, other_index[rest[near]].tolist(), config)
+
+
+def _join_anew(editor: MapEditor, landmarks: list[int], other: MapKeyframe, features: list[int], config: MappingConfig) -> None:
+    """Join landmarks with keypoints of `other`, each at the point that all its observations then agree on, where there is one."""
+    pairs: list[tuple[int, int]] = []
+    views, normalized, index = [], [], []
+    for landmark, feature in zip(landmarks, features, strict=True):
+        if landmark not in editor.observers or other.id in editor.observers[landmark]:
+            continue
+        observations = {**editor.observers.get(int(other.landmark_ids[feature]), {}), **editor.observers[landmark], other.id: feature}
+        for keyframe_id, keypoint in observations.items():
+            keyframe = editor.map.keyframes[keyframe_id]
+            views.append(keyframe.camera_from_world)
+            normalized.append(keyframe.normalized[keypoint])
+            index.append(len(pairs))
+        pairs.append((landmark, feature))
+    if not pairs:
+        return
+    start = editor.map.landmarks.points_world[editor.map.landmarks.rows(np.array([landmark for landmark, _ in pairs]))]
+    points, errors = triangulation.refine_points(np.stack(views), np.stack(normalized), np.array(index), start)
+    worst = np.zeros(len(pairs))
+    np.maximum.at(worst, index, editor.map.camera.focal * errors)
+    touched: set[int] = set()
+    for row in np.flatnonzero(worst < WORST_OF_MANY * config.max_reprojection_px).tolist():
+        landmark, feature = pairs[row]
         present = int(other.landmark_ids[feature])
-        if present == NO_LANDMARK:
-            if landmark in editor.observers:  # not fused away a moment ago
-                editor.observe(landmark, other.id, feature)
-        elif present != landmark:
-            keep, drop = sorted((landmark, present), key=lambda i: (-len(editor.observers.get(i, ())), i))
-            editor.fuse(keep, drop)
+        if landmark in touched or present in touched:
+            continue  # its observations are no longer those that were looked at
+        touched.update({landmark, present} - {NO_LANDMARK})
+        kept = _merge(editor, landmark, other, feature)
+        if kept is not None:
+            editor.place(kept, points[row])
+
+
+def _merge(editor: MapEditor, landmark: int, other: MapKeyframe, feature: int) -> int | None:
+    """A keypoint of `other` sees the landmark: observe it, or fuse it with the one the keypoint sees; returns the landmark that is left."""
+    present = int(other.landmark_ids[feature])
+    if landmark not in editor.observers:  # fused away a moment ago
+        return None
+    if present == NO_LANDMARK:
+        editor.observe(landmark, other.id, feature)
+        return landmark
+    keep, drop = sorted((landmark, present), key=lambda i: (-len(editor.observers.get(i, ())), i))
+    editor.fuse(keep, drop)
+    return keep
