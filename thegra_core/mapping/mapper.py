@@ -13,6 +13,7 @@ from thegra_core.map.editor import MapEditor
 from thegra_core.map.map import Map
 from thegra_core.mapping import culling
 from thegra_core.mapping.adjustment import adjust_all, adjust_locally
+from thegra_core.mapping.chaining import MatchGraph
 from thegra_core.mapping.expansion import expand
 from thegra_core.messages import InitialMap, Keyframe, MapSummary, MapUpdate, Matches
 
@@ -28,6 +29,7 @@ class Mapper:
         self._matcher = matcher
         self._editors: dict[int, MapEditor] = {}
         self._trial: dict[int, list[int]] = {}
+        self._graphs: dict[int, MatchGraph] = {}
 
     def initialize(self, initial: InitialMap) -> MapUpdate:
         """Begin a map from what the initializer solved; its bundle adjustment has been done."""
@@ -43,6 +45,10 @@ class Mapper:
         for message in initial.keyframes:
             editor.connect(message.id)
         self._trial[initial.map_id] = []
+        self._graphs[initial.map_id] = MatchGraph()
+        for message in initial.keyframes:
+            if message.reference_matches is not None:
+                self._graphs[initial.map_id].add(message.id, message.reference_id, message.reference_matches)
         logger.info("map %d begins with %d keyframes and %d landmarks", initial.map_id, len(initial.keyframes), len(editor.map.landmarks))
         return editor.take_update()
 
@@ -66,7 +72,7 @@ class Mapper:
 
     def drop(self, map_id: int) -> None:
         """Forget a map that tracking has given up."""
-        del self._editors[map_id], self._trial[map_id]
+        del self._editors[map_id], self._trial[map_id], self._graphs[map_id]
 
     @property
     def map_ids(self) -> list[int]:
@@ -98,7 +104,7 @@ class Mapper:
         editor.remove_landmarks(remove)
 
     def _expand(self, editor: MapEditor, keyframe: Keyframe) -> None:
-        """Match the keyframe to its neighbours, the reference first, whose matches tracking already has."""
+        """Match the keyframe to its neighbours, the reference first, whose matches tracking already has, and through them to theirs."""
         neighbours = self._choose_neighbours(editor, keyframe)
         features = keyframe.features
         known: dict[int, Matches] = {}
@@ -108,8 +114,11 @@ class Mapper:
         matched = self._matcher.match_many(features, [editor.map.keyframes[i].features for i in open_ids])
         known.update(zip(open_ids, matched, strict=True))
         before = editor.next_landmark
+        graph = self._graphs[keyframe.map_id]
         for neighbour, matches in known.items():
-            expand(editor, keyframe.id, neighbour, matches, self._config.mapping)
+            graph.add(keyframe.id, neighbour, matches)
+        for other, matches in [*known.items(), *graph.chained(keyframe.id, self._config.mapping.chained_keyframes)]:
+            expand(editor, keyframe.id, other, matches, self._config.mapping)
         self._trial[keyframe.map_id].extend(range(before, editor.next_landmark))
 
     def _choose_neighbours(self, editor: MapEditor, keyframe: Keyframe) -> list[int]:
