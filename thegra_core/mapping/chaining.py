@@ -32,7 +32,7 @@ class MatchGraph:
                 if far != keyframe_id and far not in direct:
                     paths.setdefault(far, []).append(compose(first, second))
         joined = [(far, join(parts)) for far, parts in paths.items()]
-        return sorted(joined, key=lambda item: (-len(item[1]), -item[0]))[:most]
+        return sorted((item for item in joined if len(item[1])), key=lambda item: (-len(item[1]), -item[0]))[:most]
 
 
 def reversed_matches(matches: Matches) -> Matches:
