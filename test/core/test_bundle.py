@@ -27,7 +27,7 @@ def problem(seed: int = 0, views: int = 4, count: int = 40, noise_px: float = 0.
     disturbed = cameras.copy()
     for i in np.flatnonzero(~held):
         disturbed[i] = cameras[i] @ poses.transform(poses.so3_exp(rng.normal(0, start / 5, 3)), rng.normal(0, start, 3))
-    return BundleProblem(disturbed, held, points + rng.normal(0, start, points.shape), view, point, normalized, weight, np.ones(len(view)), FOCAL)
+    return BundleProblem(disturbed, held, points + rng.normal(0, start, points.shape), view, point, normalized, weight, FOCAL)
 
 
 def cost(task: BundleProblem, cameras: np.ndarray, points: np.ndarray, used: np.ndarray) -> float:
@@ -39,7 +39,7 @@ def cost(task: BundleProblem, cameras: np.ndarray, points: np.ndarray, used: np.
 def test_squared_errors_by_hand() -> None:
     camera = poses.transform(np.eye(3), [1.0, 0, 0])  # the point (1, 0, 2) is straight ahead
     task = BundleProblem(camera[None], np.array([True]), np.array([[1.0, 0, 2], [1, 0, -2]]), np.array([0, 0]), np.array([0, 1]),
-                         np.array([[0.003, 0.004], [0, 0]]), np.ones(2), np.ones(2), 1000.0)  # fmt: skip
+                         np.array([[0.003, 0.004], [0, 0]]), np.ones(2), 1000.0)  # fmt: skip
     np.testing.assert_allclose(squared_errors(task, task.world_from_camera, task.points_world), [25.0, np.inf])
 
 
@@ -151,21 +151,18 @@ def test_outliers_are_marked_exactly() -> None:
     np.testing.assert_array_equal(found.squared_errors > CHI2, wrong)
 
 
-def test_gates_scale_the_residual_of_the_outlier_test_only() -> None:
+def test_the_outlier_test_is_on_pixels_whatever_the_weights() -> None:
     task = problem(seed=7, fixed=2, noise_px=0.0, weights="uniform")
     normalized = task.normalized.copy()
     normalized[5] += [12.0 / FOCAL, 0]
-    task = replace(task, normalized=normalized)
-    assert bundle_adjust(task, HUBER, CHI2, 20).outliers[5]
-    lenient = np.ones(len(task.gates))
-    lenient[5] = 0.01
-    assert not bundle_adjust(replace(task, gates=lenient), HUBER, CHI2, 20).outliers[5]
+    for weight in (1.0, 0.01):
+        assert bundle_adjust(replace(task, normalized=normalized, weights=np.full(len(task.weights), weight)), HUBER, CHI2, 20).outliers[5]
 
 
 def test_points_with_one_observation_are_left_alone() -> None:
     task = problem(seed=8, fixed=2)
     keep = ~((task.point_index == 7) & (task.keyframe_index != 2))
-    task = replace(task, **{name: getattr(task, name)[keep] for name in ("keyframe_index", "point_index", "normalized", "weights", "gates")})
+    task = replace(task, **{name: getattr(task, name)[keep] for name in ("keyframe_index", "point_index", "normalized", "weights")})
     found = bundle_adjust(task, HUBER, CHI2, 20)
     np.testing.assert_array_equal(found.points_world[7], task.points_world[7])
     assert (found.points_world[6] != task.points_world[6]).any()
@@ -207,7 +204,7 @@ def test_nothing_free_or_nothing_seen_changes_nothing() -> None:
     task = problem(seed=12, fixed=4)
     found = bundle_adjust(task, HUBER, CHI2, 10)
     np.testing.assert_array_equal(found.points_world, task.points_world)
-    empty = replace(task, **{name: getattr(task, name)[:0] for name in ("keyframe_index", "point_index", "normalized", "weights", "gates")})
+    empty = replace(task, **{name: getattr(task, name)[:0] for name in ("keyframe_index", "point_index", "normalized", "weights")})
     assert len(bundle_adjust(empty, HUBER, CHI2, 10).outliers) == 0
 
 
@@ -215,7 +212,7 @@ def test_an_indeterminate_system_returns_the_start() -> None:
     """A free pose that sees a single point has no solution of its own; what comes back is finite and whole."""
     task = problem(seed=13, fixed=2)
     keep = (task.keyframe_index != 3) | (task.point_index == 0)
-    task = replace(task, **{name: getattr(task, name)[keep] for name in ("keyframe_index", "point_index", "normalized", "weights", "gates")})
+    task = replace(task, **{name: getattr(task, name)[keep] for name in ("keyframe_index", "point_index", "normalized", "weights")})
     found = bundle_adjust(task, HUBER, CHI2, 10)
     assert np.isfinite(found.world_from_camera).all() and np.isfinite(found.points_world).all()
     np.testing.assert_array_equal(found.world_from_camera[:2], task.world_from_camera[:2])

@@ -35,11 +35,11 @@ def scene(landmarks: int, matches: int, noise_px: float = 0.5, wrong: float = 0.
         return np.ones(count)
 
     points = cloud(landmarks)
-    view = LandmarkView(points, seen(TRUE, points, True), ones(landmarks), ones(landmarks))
+    view = LandmarkView(points, seen(TRUE, points, True), ones(landmarks))
     shared = []
     for keyframe in KEYFRAMES:
         others = cloud(matches)
-        shared.append(SharedView(keyframe, seen(keyframe, others, False), seen(TRUE, others, True), ones(matches), ones(matches)))
+        shared.append(SharedView(keyframe, seen(keyframe, others, False), seen(TRUE, others, True), ones(matches)))
     return view, shared
 
 

@@ -55,7 +55,7 @@ def test_the_truth_is_found_among_outliers(seed: int) -> None:
     wrong = np.arange(len(points)) < 36
     normalized[wrong] += rng.uniform(20, 60, (36, 2)) * rng.choice([-1, 1], (36, 2)) / FOCAL
     ones = np.ones(len(points))
-    found = refine_pose(moved(pose, rng.normal(0, 0.02, 6)), points, normalized, FOCAL, ones, ones)
+    found = refine_pose(moved(pose, rng.normal(0, 0.02, 6)), points, normalized, FOCAL, ones)
     np.testing.assert_array_equal(found.inliers[wrong], False)
     assert found.inliers[~wrong].mean() > 0.97
     error = difference(found.camera_from_world, pose)
@@ -73,7 +73,7 @@ def test_outliers_do_not_pull_a_good_start_away(seed: int, chi2: float) -> None:
     normalized = seen[:, :2] / seen[:, 2:] + rng.normal(0, 0.3 / FOCAL, (120, 2))
     normalized[:25] = normalized[rng.permutation(25) + 40]
     ones = np.ones(120)
-    found = refine_pose(pose, points, normalized, FOCAL, ones, ones, chi2)
+    found = refine_pose(pose, points, normalized, FOCAL, ones, chi2)
     assert found.inliers[25:].mean() > 0.97 and not found.inliers[:25].sum() > 3
     assert np.linalg.norm(difference(found.camera_from_world, pose)[3:]) < 0.2
 
@@ -81,7 +81,7 @@ def test_outliers_do_not_pull_a_good_start_away(seed: int, chi2: float) -> None:
 def test_exact_observations_give_the_exact_pose() -> None:
     pose, points, normalized = view(11)
     ones = np.ones(len(points))
-    found = refine_pose(moved(pose, np.full(6, 0.02)), points, normalized, FOCAL, ones, ones)
+    found = refine_pose(moved(pose, np.full(6, 0.02)), points, normalized, FOCAL, ones)
     np.testing.assert_allclose(found.camera_from_world, pose, atol=1e-9)
     assert found.inliers.all()
 
@@ -94,7 +94,7 @@ def test_covariance_is_what_repetition_shows() -> None:
     errors, predicted = [], []
     for _ in range(200):
         noisy = normalized + rng.normal(0, 0.5 / FOCAL, normalized.shape) / np.sqrt(weights)[:, None]
-        found = refine_pose(pose, points, noisy, FOCAL, weights, np.full(60, 1e-3))
+        found = refine_pose(pose, points, noisy, FOCAL, weights, 1e4)
         errors.append(difference(found.camera_from_world, pose))
         predicted.append(found.covariance)
     deviation, expected = np.std(errors, axis=0), np.sqrt(np.diag(np.mean(predicted, axis=0)))
@@ -108,7 +108,7 @@ def test_weights_give_the_minimum_of_the_weighted_cost() -> None:
     rng = np.random.default_rng(1)
     pose, points, normalized = view(5, 30)
     normalized = normalized + rng.normal(0, 0.8 / FOCAL, normalized.shape)
-    weights, open_gate = rng.uniform(0.2, 4.0, 30), np.full(30, 1e-6)
+    weights, open_gate = rng.uniform(0.2, 4.0, 30), 1e6
 
     def cost(delta: np.ndarray, start: np.ndarray, w: np.ndarray) -> float:
         p = poses.apply(moved(start, delta), points)
@@ -122,14 +122,14 @@ def test_weights_give_the_minimum_of_the_weighted_cost() -> None:
     assert cost(np.zeros(6), found, np.ones(30)) > cost(np.zeros(6), unweighted, np.ones(30))
 
 
-def test_gate_is_on_the_pixels_times_the_gate_weights() -> None:
+def test_gate_is_on_the_pixels_whatever_the_weights() -> None:
     pose, points, normalized = view(6, 40)
     off = normalized.copy()
     off[0, 0] += 4.0 / FOCAL  # the pose gives way a little: about 3.8 px are left
     ones = np.ones(40)
-    assert not refine_pose(pose, points, off, FOCAL, ones, ones).inliers[0]
-    assert refine_pose(pose, points, off, FOCAL, ones, np.full(40, 0.25)).inliers[0]
-    assert refine_pose(pose, points, off, FOCAL, ones, ones, chi2=20.0).inliers[0]
+    assert not refine_pose(pose, points, off, FOCAL, ones).inliers[0]
+    assert not refine_pose(pose, points, off, FOCAL, 0.01 * ones).inliers[0]
+    assert refine_pose(pose, points, off, FOCAL, ones, chi2=20.0).inliers[0]
 
 
 def test_hopeless_input_gives_no_inliers_and_finite_numbers() -> None:
@@ -137,15 +137,15 @@ def test_hopeless_input_gives_no_inliers_and_finite_numbers() -> None:
     behind = poses.transform(np.diag([-1.0, 1.0, -1.0]), [0, 0, 0]) @ pose
     for start, p, n in ((behind, points, normalized), (pose, points[:2], normalized[:2]), (pose, points[:0], normalized[:0])):
         ones = np.ones(len(p))
-        found = refine_pose(start, p, n, FOCAL, ones, ones)
+        found = refine_pose(start, p, n, FOCAL, ones)
         assert np.isfinite(found.camera_from_world).all() and np.isfinite(found.covariance).all()
-    assert not refine_pose(behind, points, normalized, FOCAL, np.ones(10), np.ones(10)).inliers.any()
+    assert not refine_pose(behind, points, normalized, FOCAL, np.ones(10)).inliers.any()
 
 
 def test_an_undefined_observation_does_not_spoil_the_pose() -> None:
     pose, points, normalized = view(8, 40)
     normalized[3] = np.nan
-    found = refine_pose(pose, points, normalized, FOCAL, np.ones(40), np.ones(40))
+    found = refine_pose(pose, points, normalized, FOCAL, np.ones(40))
     assert np.isfinite(found.camera_from_world).all()
     assert not found.inliers[3] and found.inliers.sum() == 39
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thegra_core.optimization.weighting import gate_weights, observation_weights
+from thegra_core.optimization.weighting import observation_weights
 
 SCORES = np.array([0.01, 0.1, 0.2, 0.3, 0.9], dtype=np.float32)
 
@@ -32,10 +32,3 @@ def test_edge_cases(weighting: str) -> None:
     assert observation_weights(np.empty(0, np.float32), weighting).shape == (0,)
     assert np.isfinite(observation_weights(np.zeros(4, np.float32), weighting)).all()
     assert observation_weights(SCORES, weighting).dtype == np.float64
-
-
-def test_gates_are_weighted_in_the_paper_only() -> None:
-    weights = observation_weights(SCORES, "paper")
-    np.testing.assert_array_equal(gate_weights(weights, "paper"), weights)
-    np.testing.assert_array_equal(gate_weights(weights, "normalized"), np.ones(5))
-    np.testing.assert_array_equal(gate_weights(weights, "uniform"), np.ones(5))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from thegra_core.config import ThegraConfig
 from thegra_core.map.editor import MapEditor
 from thegra_core.optimization.bundle import BundleProblem, bundle_adjust
-from thegra_core.optimization.weighting import gate_weights, observation_weights
+from thegra_core.optimization.weighting import observation_weights
 
 IntArray = NDArray[np.int64]
 
@@ -57,7 +57,6 @@ def _adjust(editor: MapEditor, free: list[int], fixed: list[int], landmarks: Int
         point_index=point,
         normalized=normalized,
         weights=weights,
-        gates=gate_weights(weights, config.weighting),
         focal=editor.map.camera.focal,
     )
     result = bundle_adjust(problem, config.bundle.huber_px, config.bundle.chi2_px2, iterations)

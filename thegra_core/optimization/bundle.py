@@ -32,7 +32,7 @@ WEIGHT_STEPS_PER_OCTAVE = 4
 @dataclass(frozen=True, slots=True)
 class BundleProblem:
     """world_from_camera (K, 4, 4); fixed (K,) bool; points_world (P, 3); M observations: keyframe_index (M,), point_index (M,) rows of the former,
-    normalized (M, 2) undistorted, weights (M,) 1/px^2, gates (M,) factors of squared pixel residuals in the outlier test; focal px."""
+    normalized (M, 2) undistorted, weights (M,) 1/px^2; focal px."""
 
     world_from_camera: FloatArray
     fixed: BoolArray
@@ -41,7 +41,6 @@ class BundleProblem:
     point_index: IntArray
     normalized: FloatArray
     weights: FloatArray
-    gates: FloatArray
     focal: float
 
 
@@ -80,13 +79,13 @@ def squared_errors(problem: BundleProblem, world_from_camera: FloatArray, points
 
 def _outliers(problem: BundleProblem, world_from_camera: FloatArray, points_world: FloatArray, chi2_px2: float) -> BoolArray:
     with np.errstate(invalid="ignore"):
-        return ~(problem.gates * squared_errors(problem, world_from_camera, points_world) < chi2_px2)
+        return ~(squared_errors(problem, world_from_camera, points_world) < chi2_px2)
 
 
 def _gross(problem: BundleProblem, chi2_px2: float) -> float:
     """Squared error (px^2) beyond which an observation is left out from the start: Huber's kernel gives each wrong match the pull of a good one, and
     where the baseline is short many of them together bend the scene. Wide enough for a start that is bad as a whole."""
-    errors = problem.gates * squared_errors(problem, problem.world_from_camera, problem.points_world)
+    errors = squared_errors(problem, problem.world_from_camera, problem.points_world)
     finite = errors[np.isfinite(errors)]
     return max(GROSS * chi2_px2, GROSS * float(np.median(finite))) if len(finite) else np.inf
 

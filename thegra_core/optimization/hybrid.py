@@ -28,23 +28,21 @@ _DELTA = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class LandmarkView:
-    """Landmarks points_world (N, 3) seen at normalized (N, 2), with weights (N,) in 1/px^2 and gates (N,), factors of squared pixel residuals."""
+    """Landmarks points_world (N, 3) seen at normalized (N, 2), with weights (N,) in 1/px^2."""
 
     points_world: FloatArray
     normalized: FloatArray
     weights: FloatArray
-    gates: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class SharedView:
-    """Matches with a posed camera: its camera_from_world (4, 4), normalized there and here (M, 2), weights (M,) in 1/px^2 and gates (M,)."""
+    """Matches with a posed camera: its camera_from_world (4, 4), normalized there and here (M, 2), weights (M,) in 1/px^2."""
 
     camera_from_world: FloatArray
     there: FloatArray
     here: FloatArray
     weights: FloatArray
-    gates: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +121,9 @@ def _gate(
     pose: FloatArray, landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, chi2: float
 ) -> tuple[BoolArray, list[BoolArray]]:
     """Landmarks and matches within `chi2` px^2 of the pose; matches by the share of it that their one degree of freedom has."""
-    seen = landmarks.gates * _squared_errors(pose, landmarks, focal) < chi2
+    seen = _squared_errors(pose, landmarks, focal) < chi2
     limit = chi2 * EPIPOLAR_CHI2 / 5.991
-    return seen, [view.gates * (focal * _sampson(pose, view)) ** 2 < limit for view in shared]
+    return seen, [(focal * _sampson(pose, view)) ** 2 < limit for view in shared]
 
 
 def _gauss_newton(pose: FloatArray, landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, huber: float) -> tuple[FloatArray, FloatArray]:
@@ -173,8 +171,8 @@ def _moved(pose: FloatArray, step: FloatArray) -> FloatArray:
 
 
 def _seen_part(view: LandmarkView, keep: BoolArray) -> LandmarkView:
-    return LandmarkView(view.points_world[keep], view.normalized[keep], view.weights[keep], view.gates[keep])
+    return LandmarkView(view.points_world[keep], view.normalized[keep], view.weights[keep])
 
 
 def _shared_part(view: SharedView, keep: BoolArray) -> SharedView:
-    return SharedView(view.camera_from_world, view.there[keep], view.here[keep], view.weights[keep], view.gates[keep])
+    return SharedView(view.camera_from_world, view.there[keep], view.here[keep], view.weights[keep])

@@ -47,18 +47,17 @@ def refine_pose(
     normalized: FloatArray,
     focal: float,
     weights: FloatArray,
-    gates: FloatArray,
     chi2: float = 5.991,
 ) -> PoseEstimate:
     """Least robust weighted reprojection error over one pose.
 
     Four rounds of at most ten Gauss-Newton steps; after each, observations beyond the gate sit out the next round, grossly wrong ones the first; the
     Huber kernel is off in the last.
-    points_world (N, 3); normalized (N, 2) undistorted; focal in px turns their differences into pixels; weights (N,) 1/px^2; gates (N,) multiply
-    squared pixel residuals before they are compared with chi2 (px^2). Undefined (NaN) observations are outliers.
+    points_world (N, 3); normalized (N, 2) undistorted; focal in px turns their differences into pixels; weights (N,) 1/px^2; chi2
+    (px^2) limits squared pixel residuals, whatever the weights. Undefined (NaN) observations are outliers.
     """
     pose = camera_from_world
-    start = gates * (focal * triangulation.reprojection_errors(pose, points_world, normalized)) ** 2
+    start = (focal * triangulation.reprojection_errors(pose, points_world, normalized)) ** 2
     finite = start[np.isfinite(start)]
     inliers: BoolArray = start < GROSS * max(chi2, float(np.median(finite)) if len(finite) else np.inf)
     hessian = np.eye(6)
@@ -66,7 +65,7 @@ def refine_pose(
         robust = round_index < ROUNDS - 1
         pose, hessian = _gauss_newton(pose, points_world[inliers], normalized[inliers], focal, weights[inliers], np.sqrt(chi2) if robust else np.inf)
         squared = (focal * triangulation.reprojection_errors(pose, points_world, normalized)) ** 2
-        inliers = gates * squared < chi2
+        inliers = squared < chi2
         if inliers.sum() < 4:
             break
     count = int(inliers.sum())

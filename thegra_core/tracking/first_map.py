@@ -86,7 +86,7 @@ def _place_between(table: TrackTable, points: FloatArray, good: BoolArray, last_
         if inliers < 6:
             return None
         ones = np.ones(int(seen.sum()))
-        views.append(refine_pose(pose, points[seen], table.normalized[view][seen], table.focal, ones, ones, 16 * config.bundle.chi2_px2).camera_from_world)
+        views.append(refine_pose(pose, points[seen], table.normalized[view][seen], table.focal, ones, 16 * config.bundle.chi2_px2).camera_from_world)
     views.append(last_from_first)
     return np.stack(views)
 
@@ -104,7 +104,6 @@ def _problem(table: TrackTable, camera_from_world: FloatArray, points: FloatArra
         point_index=point.astype(np.int64),
         normalized=table.normalized[view, point],
         weights=table.weights[view, point],
-        gates=np.ones(len(view)),
         focal=table.focal,
     )
 

@@ -16,7 +16,7 @@ from thegra_core.map.projection import VisibleLandmarks, match_by_projection, vi
 from thegra_core.messages import NO_LANDMARK, Features, Matches
 from thegra_core.optimization.hybrid import LandmarkView, SharedView, estimate_hybrid_pose, refine_hybrid_pose
 from thegra_core.optimization.pose import PoseEstimate, estimate_pose, refine_pose
-from thegra_core.optimization.weighting import gate_weights, observation_weights
+from thegra_core.optimization.weighting import observation_weights
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -46,20 +46,19 @@ class Localization:
 
 
 class FrameView:
-    """A frame's features with what each step needs of them: undistorted coordinates (N, 2), weights (N,) and gate weights (N,)."""
+    """A frame's features with what each step needs of them: undistorted coordinates (N, 2) and weights (N,)."""
 
     def __init__(self, features: Features, camera: CameraModel, config: ThegraConfig) -> None:
         self.features = features
         self.normalized = camera.undistort(features.keypoints.astype(np.float64))
         self.defined = np.asarray(np.isfinite(self.normalized).all(axis=1))
         self.weights = observation_weights(features.scores, config.weighting)
-        self.gates = gate_weights(self.weights, config.weighting)
         self.focal = camera.focal
 
     def refine(self, camera_from_world: FloatArray, points_world: FloatArray, keypoints: IntArray, chi2_px2: float) -> PoseEstimate:
         """Motion-only bundle adjustment on points (M, 3) seen by keypoints (M,)."""
         return refine_pose(
-            camera_from_world, points_world, self.normalized[keypoints], self.focal, self.weights[keypoints], self.gates[keypoints], chi2_px2
+            camera_from_world, points_world, self.normalized[keypoints], self.focal, self.weights[keypoints], chi2_px2
         )
 
 
@@ -134,7 +133,7 @@ def _local_landmarks(current: Map, reference_id: int, camera_from_world: FloatAr
 
 def _landmark_view(current: Map, view: FrameView, keypoints: IntArray, ids: IntArray) -> LandmarkView:
     points = current.landmarks.points_world[current.landmarks.rows(ids)]
-    return LandmarkView(points, view.normalized[keypoints], view.weights[keypoints], view.gates[keypoints])
+    return LandmarkView(points, view.normalized[keypoints], view.weights[keypoints])
 
 
 def _matches_without_landmarks(current: Map, view: FrameView, matched: Mapping[int, Matches], with_landmark: IntArray) -> tuple[list[SharedView], int]:
@@ -147,7 +146,7 @@ def _matches_without_landmarks(current: Map, view: FrameView, matched: Mapping[i
         there = keyframe.normalized[matches.indices[:, 1]]
         use = usable[matches.indices[:, 0]] & np.isfinite(there).all(axis=1)
         here = matches.indices[use, 0]
-        shared.append(SharedView(keyframe.camera_from_world, there[use], view.normalized[here], view.weights[here], view.gates[here]))
+        shared.append(SharedView(keyframe.camera_from_world, there[use], view.normalized[here], view.weights[here]))
         count += int(use.sum())
     return shared, count
 
