@@ -21,11 +21,8 @@ IntArray = NDArray[np.int64]
 def expand(editor: MapEditor, keyframe_id: int, neighbour_id: int, matches: Matches, config: MappingConfig) -> int:
     """Use the matches (query: keyframe, reference: neighbour) of two keyframes; returns how many landmarks were created.
 
-    Where one side sees a landmark the other joins it, where both see different ones they are fused, where neither does a point is triangulated if the
-    keyframes stand far enough apart. Everything must reproject, and a new point must pass `accept_points`.
-
-    That test of the baseline is what keeps the map's scale. A limit on each point's own parallax alone picks, of points near it, those that noise has moved
-    further: they are placed too near, and each keyframe makes the world a little smaller.
+    Where one side sees a landmark the other joins it, where both see different ones they are fused, where neither does a point is
+    triangulated. Everything must reproject, and a new point must pass `accept_points`.
     """
     keyframe, neighbour = editor.map.keyframes[keyframe_id], editor.map.keyframes[neighbour_id]
     query, reference = matches.indices[:, 0].astype(np.int64), matches.indices[:, 1].astype(np.int64)
@@ -33,8 +30,6 @@ def expand(editor: MapEditor, keyframe_id: int, neighbour_id: int, matches: Matc
     query, reference = query[defined], reference[defined]
     _join(editor, keyframe, neighbour, query, reference, config)
     _join(editor, neighbour, keyframe, reference, query, config)
-    if np.linalg.norm(keyframe.center - neighbour.center) < config.min_baseline_ratio * editor.map.median_depth(keyframe_id):
-        return 0
     free = (keyframe.landmark_ids[query] == NO_LANDMARK) & (neighbour.landmark_ids[reference] == NO_LANDMARK)
     query, reference = query[free], reference[free]
     points, good = accept_points(keyframe, neighbour, query, reference, editor.map.camera.focal, config)
