@@ -7,6 +7,9 @@ set -euo pipefail
 for profile in quality fast; do
     "$BIN/thegra" weights fetch --profile "$profile"
 done
+if [[ ${CI:-} == true ]]; then
+    "$BIN/thegra" weights fetch aliked-n16rot
+fi
 if [[ ${THEGRA_ACCEPT_SUPERPOINT_LICENCE:-} == 1 || ${CI:-} == true ]]; then
     "$BIN/thegra" weights fetch --profile paper --accept-licence
 else
