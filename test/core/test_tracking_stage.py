@@ -217,6 +217,32 @@ def test_a_camera_that_stays_elsewhere_begins_a_new_map_beside_the_old() -> None
     assert {o.result.map_id for o in pair.outputs[40:]} == {1} and len(second) > 25
 
 
+def test_a_view_of_few_landmarks_is_placed_by_its_other_matches() -> None:
+    """All but a dozen of the landmarks are gone, as where the camera has turned to what the map hardly holds; the keyframe's keypoints are still matched."""
+    pair, world, path = Pair(), cloud(count=500, seed=4), sideways(24, 0.05)
+    pair.run(world, path[:20])
+    before = pair.outputs[-1].result.world_from_camera
+    place = pair.tracking._place
+    assert place is not None and before is not None
+    seen = place.map.keyframes[place.reference_id].landmark_ids
+    kept = seen[seen >= 0][:12]
+    alive = place.map.landmarks.alive_ids()
+    place.map.landmarks.remove(alive[~np.isin(alive, kept)])
+    result = pair.tracking.process(observe(world, path[20], stamp(20), 0.3, 0.9, 10), None).result
+    assert result.state is TrackingState.TRACKING and result.inliers < CONFIG.tracking.min_inliers
+    found, true = poses.inverse(before) @ result.world_from_camera, poses.inverse(path[19]) @ path[20]
+    assert np.degrees(poses.rotation_angle(found[:3, :3].T @ true[:3, :3])) < 0.3
+    step = float(np.linalg.norm(before[:3, 3] - pair.outputs[-2].result.world_from_camera[:3, 3]))
+    assert np.linalg.norm(found[:3, 3]) == pytest.approx(step, rel=0.4)
+    none = Pair(ThegraConfig.model_validate({"tracking": {"min_sparse_landmarks": 50}}))
+    none.run(world, path[:20])
+    place = none.tracking._place
+    assert place is not None
+    alive = place.map.landmarks.alive_ids()
+    place.map.landmarks.remove(alive[~np.isin(alive, kept)])
+    assert none.tracking.process(observe(world, path[20], stamp(20), 0.3, 0.9, 10), None).result.state is TrackingState.LOST
+
+
 def until_first_map(pair: Pair, world: World) -> int:
     """See the world until a map begins; the number of frames that took."""
     for index, pose in enumerate(sideways(40, 0.05)):
