@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -156,6 +156,10 @@ Filter = Annotated[
     | RepairDeadPixels,
     Field(discriminator="filter"),
 ]
+
+
+FILTER_SECTIONS: tuple[type[Section], ...] = get_args(get_args(Filter)[0])
+"""The section of every filter."""
 
 
 class ShutterConfig(Section):

@@ -22,11 +22,7 @@ from thegra_core.preprocessing.stability import SteadyWindow
 from thegra_core.sources.open import open_recording
 
 DTYPES = (np.uint8, np.uint16, np.float32)
-SECTIONS = (
-    cfg.ChambolleTv, cfg.HistogramClip, cfg.HistogramCdf, cfg.Clahe, cfg.Median, cfg.BandPass, cfg.Bilateral, cfg.DifferenceOfGaussians,
-    cfg.PercentileStretch, cfg.KelvinWindow, cfg.Destripe, cfg.SvdDestripe, cfg.RepairDeadPixels,
-)  # fmt: skip
-EVERY_FILTER = tuple(section() for section in SECTIONS)
+EVERY_FILTER = tuple(section() for section in cfg.FILTER_SECTIONS)
 ENDS_IN_8_BIT = tuple(section() for section in (cfg.HistogramClip, cfg.HistogramCdf, cfg.PercentileStretch))
 BEFORE_8_BIT = tuple(section for section in EVERY_FILTER if section.filter not in ("kelvin_window", "clahe", "band_pass"))
 """Those that a constant offset of the counts passes through; CLAHE's bins are fixed, the band-pass takes the magnitude."""

@@ -127,8 +127,10 @@ def _frames_of(recordings: Sequence[Path], count: int) -> list[ImageArray]:
         return [render(SCENES["room"](0), rays, PATHS["room"].world_from_camera(float(i)), 3.0, rng).image for i in range(count)]
     chosen: list[ImageArray] = []
     for path in recordings:
-        images = [frame.image for frame in open_recording(path).frames()]
-        chosen += [images[i] for i in np.unique(np.linspace(0, len(images) - 1, count).round().astype(int))] if images else []
+        recording = open_recording(path)
+        total = sum(1 for _ in recording.frames())  # read twice, so that a long recording need not fit in memory
+        wanted = set(np.linspace(0, total - 1, count).round().astype(int).tolist()) if total else set()
+        chosen += [frame.image for i, frame in enumerate(recording.frames()) if i in wanted]
     if not chosen:
         raise InputError("the recordings hold no readable image; what they hold is told by: thegra info INPUT")
     return chosen

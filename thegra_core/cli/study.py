@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -79,8 +80,9 @@ def _write(plan: Plan, rows: list[Row]) -> list[Path]:
 
 def _write_detections(plan: Plan) -> Path:
     """The middle frame of the first recording before and after."""
-    frames = list(open_recording(plan.recordings[0]).frames())
-    frame = frames[len(frames) // 2]
+    recording = open_recording(plan.recordings[0])
+    middle = sum(1 for _ in recording.frames()) // 2
+    frame = next(itertools.islice(recording.frames(), middle, None))
     extractor = make_extractor(FRONT_ENDS[plan.front_end].extractor)
     images = [Chain(CHAINS[name])(frame.image, frame.stamp_ns) for name in ("stretch", PAPER_CHAIN)]
     features = [extractor.extract(image, frame.stamp_ns) for image in images]

@@ -20,10 +20,6 @@ from thegra_core.preprocessing.chain import FILTERS, Chain
 from thegra_core.preprocessing.windows import PAPER_TAIL
 
 Reference = Callable[[ImageArray], NDArray[Any]]
-SECTIONS = (
-    cfg.ChambolleTv, cfg.HistogramClip, cfg.HistogramCdf, cfg.Clahe, cfg.Median, cfg.BandPass, cfg.Bilateral, cfg.DifferenceOfGaussians,
-    cfg.PercentileStretch, cfg.KelvinWindow, cfg.Destripe, cfg.SvdDestripe, cfg.RepairDeadPixels,
-)  # fmt: skip
 ON_8_BIT = ("bilateral", "median")
 """Filters that the paper's chains put after the map to 8 bit, or that libraries offer for 8 bit."""
 
@@ -43,8 +39,9 @@ def benchmark(frames: Sequence[ImageArray], repeats: int = 5, progress: Callable
     cv2.setNumThreads(1)
     try:
         filters = {}
-        for section in SECTIONS:
-            name, parameters = section().filter, section().model_dump(exclude={"filter"})
+        for section in cfg.FILTER_SECTIONS:
+            parameters = section().model_dump()
+            name = parameters.pop("filter")
             say(name)
             images = [_to_8_bit(f) for f in frames] if name in ON_8_BIT else list(frames)
             filters[name] = _time(functools.partial(FILTERS[name], **parameters), REFERENCES.get(name), images, repeats)
