@@ -274,7 +274,9 @@ class BundleConfig(Section):
     local_keyframes: int = Field(20, ge=2, description="keyframes optimised with the new one; a window of 12 drifts more in scale where keyframes follow each other closely (measured)")
     fixed_keyframes: int = Field(20, ge=1, description="outer keyframes kept fixed at the most")
     iterations: int = Field(10, ge=1, description="Levenberg-Marquardt steps a stage")
+    tolerance: float = Field(1e-4, gt=0, description="a step that lessens the cost by a smaller share ends a stage of a local adjustment")
     full_iterations: int = Field(30, ge=1, description="steps of the full adjustment at the end")
+    full_tolerance: float = Field(1e-5, gt=0, description="the same of the full adjustment")
     huber_px: float = Field(2.447, gt=0, description="px; sqrt(5.991)")
     chi2_px2: float = Field(5.991, gt=0, description="px^2; observations beyond are outliers")
 

@@ -23,7 +23,7 @@ def adjust_locally(editor: MapEditor, keyframe_id: int, config: ThegraConfig) ->
     if not outer:  # the whole map is local: its oldest keyframe holds the frame
         outer = [min(local)]
         local = [i for i in local if i not in outer]
-    _adjust(editor, sorted(local), sorted(outer), landmarks, config, config.bundle.iterations)
+    _adjust(editor, sorted(local), sorted(outer), landmarks, config, config.bundle.iterations, config.bundle.tolerance)
 
 
 def adjust_all(editor: MapEditor, config: ThegraConfig) -> None:
@@ -31,10 +31,10 @@ def adjust_all(editor: MapEditor, config: ThegraConfig) -> None:
     ids = sorted(editor.map.keyframes)
     if len(ids) < 2:
         return
-    _adjust(editor, ids[1:], ids[:1], editor.map.landmarks.alive_ids(), config, config.bundle.full_iterations)
+    _adjust(editor, ids[1:], ids[:1], editor.map.landmarks.alive_ids(), config, config.bundle.full_iterations, config.bundle.full_tolerance)
 
 
-def _adjust(editor: MapEditor, free: list[int], fixed: list[int], landmarks: IntArray, config: ThegraConfig, iterations: int) -> None:
+def _adjust(editor: MapEditor, free: list[int], fixed: list[int], landmarks: IntArray, config: ThegraConfig, iterations: int, tolerance: float) -> None:
     if not free or len(landmarks) == 0:
         return
     keyframe_ids = np.array([*free, *fixed], dtype=np.int64)
@@ -59,7 +59,7 @@ def _adjust(editor: MapEditor, free: list[int], fixed: list[int], landmarks: Int
         weights=weights,
         focal=editor.map.camera.focal,
     )
-    result = bundle_adjust(problem, config.bundle.huber_px, config.bundle.chi2_px2, iterations)
+    result = bundle_adjust(problem, config.bundle.huber_px, config.bundle.chi2_px2, iterations, tolerance)
     moved = ~problem.fixed
     editor.move(keyframe_ids[moved], result.world_from_camera[moved], landmarks, result.points_world)
     for index in np.flatnonzero(result.outliers).tolist():

@@ -55,7 +55,7 @@ def solve_first_map(table: TrackTable, last_from_first: FloatArray, model: str, 
     if views is None:
         return None
     problem = _problem(table, views, points, good)
-    result = bundle_adjust(problem, config.bundle.huber_px, config.bundle.chi2_px2, config.bundle.full_iterations)
+    result = bundle_adjust(problem, config.bundle.huber_px, config.bundle.chi2_px2, config.bundle.full_iterations, config.bundle.full_tolerance)
     return _judge(table, problem, result.world_from_camera, result.points_world, model, config)
 
 
