@@ -168,6 +168,7 @@ class ShutterConfig(Section):
     enabled: bool = Field(True, description="look for closures; off for cameras without a shutter")
     gap_periods: float = Field(4.0, gt=1, description="frame periods; a longer gap between stamps counts as a closure when the stream runs evenly")
     max_jitter: float = Field(0.3, gt=0, description="relative spread of the period above which gaps say nothing (photo flights)")
+    longest_s: float = Field(5.0, gt=0, description="seconds after which images of nothing but noise are a bare wall, no shutter; FLIR's cores take 0.25 to 1 s")
 
 
 class PreprocessingConfig(Section):
@@ -242,6 +243,7 @@ class TrackingConfig(Section):
     min_descriptor_similarity: float = Field(0.75, ge=-1, le=1, description="cosine of float descriptors; 1 - 2 * Hamming share of binary ones")
     descriptor_ratio: float = Field(0.9, gt=0, le=1, description="best over second-best descriptor distance among candidates")
     chi2_px2: float = Field(5.991, gt=0, description="px^2; 95 % of chi-square with 2 degrees of freedom at 1 px")
+    mask_fixed_pattern: bool = Field(True, description="learn where keypoints stay on one pixel while the image moves, and use none there")
 
 
 class KeyframeConfig(Section):
@@ -285,6 +287,8 @@ class RelocalizationConfig(Section):
     """What happens after tracking is lost."""
 
     keyframes: int = Field(3, ge=1, description="last keyframes that a lost frame is matched to")
+    search_keyframes: int = Field(6, ge=1, description="the same after a shutter closure")
+    search_frames: int = Field(5, ge=0, description="frames after a closure that are matched to so many before tracking counts as lost")
     min_inliers: int = Field(30, ge=6, description="inliers of an accepted relocalisation")
     remembered_frames: int = Field(150, ge=0, description="frames without a pose whose features are kept, to be placed in the map afterwards")
     new_map_after_frames: int = Field(5, ge=1, description="frames lost before a new map is begun beside the old one")

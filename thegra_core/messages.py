@@ -47,20 +47,28 @@ class Shutter(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One image of the stream: (H, W) uint8, uint16 or float32, single channel, native byte order."""
+    """One image of the stream: (H, W) uint8, uint16 or float32, single channel, native byte order.
+
+    shutter_closed is what the camera itself says of its shutter; None where it says nothing.
+    """
 
     stamp_ns: int
     index: int
     image: ImageArray
+    shutter_closed: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class ShutterState:
-    """Whether the camera can see at `stamp_ns`, and how that was found out."""
+    """Whether the camera can see at `stamp_ns`, and how that was found out.
+
+    recalibrated: this is the first image since the shutter set level and fixed pattern anew, whether or not it hid anything.
+    """
 
     stamp_ns: int
     shutter: Shutter
     reason: str = ""
+    recalibrated: bool = False
 
 
 @dataclass(frozen=True, slots=True)

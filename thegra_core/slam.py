@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
+from thegra_core.features.fixed_pattern import FixedPatternMask
 from thegra_core.features.protocols import Extractor, Matcher
 from thegra_core.features.registry import make_extractor, make_matcher
 from thegra_core.geometry.camera import CameraModel
@@ -24,6 +25,7 @@ from thegra_core.snapshots import SnapshotKeeper
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
 
 FloatArray = NDArray[np.float64]
+_NO_POSE = (TrackingState.INITIALIZING, TrackingState.LOST, TrackingState.RELOCALIZING)
 BACKWARD_FRAMES = 3
 """Backward stamps in a row that are refused before time is believed to have been set back."""
 
@@ -43,7 +45,7 @@ class _Placed:
     @property
     def may_be_placed(self) -> bool:
         """A good frame that had no pose at its time."""
-        return not self.bad and self.reference_from_camera is None and self.result.state in (TrackingState.INITIALIZING, TrackingState.LOST)
+        return not self.bad and self.reference_from_camera is None and self.result.state in _NO_POSE
 
 
 class Slam:
@@ -57,6 +59,8 @@ class Slam:
         self._camera = camera
         self._chain = Chain(config.preprocessing)
         self._shutter = ShutterDetector(config.preprocessing.shutter)
+        self._fixed_pattern = FixedPatternMask()
+        self._masks = config.tracking.mask_fixed_pattern
         self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
         self._matcher = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
         self._tracking = TrackingStage(camera, config, self._matcher)
@@ -85,8 +89,11 @@ class Slam:
             with self._timed("shutter"):
                 shutter = self._shutter.update(frame)
             self._note_closure(shutter)
-            if shutter.shutter is Shutter.JUST_OPENED:
+            if shutter.recalibrated:
                 self._chain.reset()
+                self._fixed_pattern.forget()
+            if shutter.shutter is Shutter.JUST_OPENED:
+                self._tracking.reopen()
             output = self._tracking.hold(frame.stamp_ns, shutter.reason) if shutter.shutter is Shutter.CLOSED else self._see(frame)
         self._stage_ms["total"] = 1e3 * (time.perf_counter() - begin)
         result = replace(output.result, stage_ms=dict(self._stage_ms))
@@ -145,9 +152,12 @@ class Slam:
             image = self._chain(frame.image, frame.stamp_ns)
         with self._timed("extraction"):
             features = self._extractor.extract(image, frame.stamp_ns)
+            features = self._fixed_pattern.apply(features)
         reference = self._tracking.reference_features
         with self._timed("matching"):
             matches = self._matcher.match(features, reference) if reference is not None else None
+            if reference is not None and matches is not None and self._masks:
+                matches = self._fixed_pattern.learn(features, reference, matches)
         with self._timed("tracking"):
             output = self._tracking.process(features, matches)
         if output.dropped_map_id is not None:

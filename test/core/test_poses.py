@@ -108,3 +108,13 @@ def test_nearest_rotation_of_a_disturbed_one_and_of_a_mirror() -> None:
     rotation = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
     np.testing.assert_allclose(poses.nearest_rotation(2.5 * rotation), rotation, atol=1e-12)
     assert np.linalg.det(poses.nearest_rotation(np.diag([1.0, 1.0, -1.0]) @ rotation)) == pytest.approx(1.0)
+
+
+def test_adjoint_carries_small_motions():
+    a_from_b = poses.transform(poses.so3_exp([0.3, -0.5, 0.9]), [1.0, -2.0, 0.5])
+    small = 1e-6 * np.array([1.0, -2, 3, 0.5, -1, 2])
+
+    def move(twist):
+        return poses.transform(poses.so3_exp(twist[:3]), twist[3:])
+
+    np.testing.assert_allclose(a_from_b @ move(small), move(poses.adjoint(a_from_b) @ small) @ a_from_b, atol=1e-10)

@@ -106,6 +106,54 @@ def test_change_of_size_is_a_new_image():
     assert states([image(0), image(0)[:, :40], image(0)]) == [OPEN] * 3
 
 
+def test_repeats_with_another_constant_are_repeats():
+    frozen = image(2)
+    images = [image(0), image(1), frozen, frozen + 7, frozen - 5, image(3)]
+    assert states(images) == [OPEN, OPEN, OPEN, CLOSED, CLOSED, JUST_OPENED]
+
+
+def test_what_the_camera_says():
+    detector = ShutterDetector(ShutterConfig())
+    flags = [None, False, True, True, False, False]
+    said = [detector.update(Frame(10**18 + i * 40 * MS, i, image(i), flag)) for i, flag in enumerate(flags)]
+    assert [s.shutter for s in said] == [OPEN, OPEN, CLOSED, CLOSED, JUST_OPENED, OPEN]
+    assert said[2].reason == "the camera says so"
+    assert [s.recalibrated for s in said] == [False] * 4 + [True, False]
+
+
+def test_blade_in_front_of_the_sensor():
+    rng = np.random.default_rng(0)
+    blade = [(2500 + rng.normal(0, 2, (64, 80))).astype(np.uint16) for _ in range(5)]
+    result = run([*(image(i) for i in range(20)), *blade, *(image(i) for i in range(30, 40))])
+    assert [s.shutter for s in result] == [OPEN] * 20 + [CLOSED] * 5 + [JUST_OPENED] + [OPEN] * 9
+    assert result[20].reason == "the image shows nothing but noise"
+
+
+def test_bare_wall_is_no_shutter_for_long():
+    rng = np.random.default_rng(0)
+    wall = [(2500 + rng.normal(0, 2, (64, 80))).astype(np.uint16) for _ in range(60)]
+    stamps = 10**18 + np.arange(80) * 200 * MS
+    result = states([*(image(i) for i in range(20)), *wall], stamps)
+    assert CLOSED in result[20:46]
+    assert set(result[50:]) == {OPEN}
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_closure_between_two_frames(even):
+    """Where a photo flight has no period, what happens between two photos hides nothing; the pattern is new all the same."""
+    picture = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 1, (300, 300)), (0, 0), 3) * 400
+    patterns = np.random.default_rng(1).normal(0, 4, (2, 128, 160))
+    images = [
+        (3000 + picture[i : i + 128, 2 * i : 2 * i + 160] + patterns[int(i >= 30)] + np.random.default_rng(i).normal(0, 3, (128, 160))).astype(np.uint16)
+        for i in range(40)
+    ]
+    stamps = 10**18 + np.arange(40) * (40 * MS if even else 2 * 10**9)
+    result = run(images, stamps)
+    assert [i for i, s in enumerate(result) if s.recalibrated] == [30]
+    assert [s.shutter for s in result] == [OPEN] * 30 + [JUST_OPENED if even else OPEN] + [OPEN] * 9
+    assert "pattern changed" in result[30].reason
+
+
 def test_disabled():
     assert states([image(0)] * 4, config=ShutterConfig(enabled=False)) == [OPEN] * 4
 
@@ -115,6 +163,7 @@ def test_recordings(shared_data):
     for folder in sorted(path.parent for path in shared_data.glob("*/images.txt")):
         detector = ShutterDetector(ShutterConfig())
         result = [detector.update(frame) for frame in open_recording(folder).frames()]
+        assert [s.recalibrated for s in result if s.shutter is JUST_OPENED] == [True] * sum(s.shutter is JUST_OPENED for s in result)
         closed = [s.stamp_ns for s in result if s.shutter is CLOSED]
         if not (folder / "shutter.txt").exists():
             assert all(s.shutter is OPEN for s in result), folder.name
@@ -126,3 +175,18 @@ def test_recordings(shared_data):
         begins = [t for t in closed if t - period not in closed and not any(abs(t - period - other) < period / 2 for other in closed)]
         np.testing.assert_allclose(begins, closures[:, 0], atol=2 * period)
         np.testing.assert_allclose(opened, closures[:, 1], atol=2 * period)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("evenly", [False, True], ids=["gap", "no trace in the stamps"])
+def test_recording_without_its_frozen_frames(shared_data, evenly):
+    """The closures are found by the gap they leave, and where frames are numbered and not timed, by the sensor's new pattern."""
+    folder = shared_data / "sim_room_shutter"
+    closures = np.loadtxt(folder / "shutter.txt", ndmin=2) * 1e9
+    frames = [f for f in open_recording(folder).frames() if not any(begin <= f.stamp_ns < end for begin, end in closures)]
+    stamps = [10**18 + i * 100 * MS if evenly else f.stamp_ns for i, f in enumerate(frames)]
+    detector = ShutterDetector(ShutterConfig())
+    result = [detector.update(Frame(stamp, i, f.image)) for i, (stamp, f) in enumerate(zip(stamps, frames, strict=True))]
+    after = [next(i for i, f in enumerate(frames) if f.stamp_ns >= end) for _, end in closures]
+    assert [i for i, s in enumerate(result) if s.shutter is JUST_OPENED] == after
+    assert all(s.shutter is not CLOSED for s in result)

@@ -10,6 +10,7 @@ import pytest
 from bag_making import (
     COMPRESSED,
     IMAGE,
+    RECEIVED_LATER,
     ROS1,
     ROS2,
     T0,
@@ -184,6 +185,37 @@ def test_wrong_topic_lists_what_there_is(tmp_path):
         open_recording(path, "/camera/image")
     assert "/thermal/image_raw  Image, 6 messages 32x24 mono16" in str(error.value)
     assert f"thegra run {path} --topic /thermal/image_raw" in str(error.value)
+
+
+FLAGS = {"Bool": (False, True), "UInt8": (0, 2)}
+
+
+def flag_items(store, kind, changes):
+    """The camera's word on its shutter: {time (ns after the first image): closed}."""
+    full = f"std_msgs/msg/{kind}"
+    return [("/boson/ffc", full, store.types[full](data=FLAGS[kind][closed]), T0 + RECEIVED_LATER + after) for after, closed in changes.items()]
+
+
+@pytest.mark.parametrize("kind", FLAGS)
+@pytest.mark.parametrize("ros", [1, 2])
+def test_shutter_topic(tmp_path, kind, ros):
+    store, write = (ROS1, write_ros1) if ros == 1 else (ROS2, write_ros2)
+    items = sorted([*stream(store, 8), *flag_items(store, kind, {150_000_000: False, 250_000_000: True, 550_000_000: False})], key=lambda item: item[3])
+    recording = open_recording(write(tmp_path / "a.bag", items), shutter_topic="boson/ffc")
+    assert [f.shutter_closed for f in recording.frames()] == [None, None, False, True, True, True, False, False]
+    assert [f.index for f in recording.frames()] == list(range(8))
+    assert {f.shutter_closed for f in open_recording(recording.path).frames()} == {None}
+
+
+def test_wrong_shutter_topic_lists_what_there_is(tmp_path):
+    path = write_ros2(tmp_path / "a", [*stream(ROS2), *flag_items(ROS2, "Bool", {0: False})])
+    with pytest.raises(InputError, match=r"(?s)has no topic '/ffc'.*such topics are:\n  /boson/ffc  std_msgs/msg/Bool"):
+        open_recording(path, shutter_topic="/ffc")
+    with pytest.raises(InputError, match="such topics are: none"):
+        open_recording(write_ros2(tmp_path / "b", stream(ROS2)), shutter_topic="/ffc")
+    (tmp_path / "images").mkdir()
+    with pytest.raises(InputError, match=r"--shutter-topic /ffc is given but .* is no bag"):
+        open_recording(tmp_path / "images", shutter_topic="/ffc")
 
 
 def test_topic_without_slash_and_without_compressed(tmp_path):

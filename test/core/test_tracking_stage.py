@@ -318,6 +318,38 @@ def test_hold_predicts_with_constant_velocity_and_changes_nothing() -> None:
     assert {o.result.state for o in pair.outputs[20:]} == {TrackingState.TRACKING}
 
 
+def test_what_is_held_grows_uncertain_and_ends() -> None:
+    pair = Pair()
+    pair.run(cloud(count=500, seed=6), sideways(20, 0.05))
+    last = pair.outputs[-1].result
+    held = [pair.tracking.hold(stamp(i), "closed").result for i in range(20, 25)]
+    spreads = [np.sqrt(np.diag(r.covariance)[3:].sum()) for r in [last, *held]]
+    assert np.all(np.diff(spreads) > 0)
+    np.testing.assert_allclose(spreads[5], 5 * np.sqrt(3) * np.linalg.norm(held[0].world_from_camera[:3, 3] - last.world_from_camera[:3, 3]), rtol=0.1)
+    longest = ThegraConfig().preprocessing.shutter.longest_s
+    stuck = pair.tracking.hold(last.stamp_ns + int((longest + 0.1) * 1e9), "closed").result
+    assert stuck.state is TrackingState.HOLD and stuck.world_from_camera is None and stuck.covariance is None
+
+
+def test_after_a_closure_the_place_is_sought_before_it_counts_as_lost() -> None:
+    pair = Pair()
+    world, elsewhere = cloud(count=500, seed=6), cloud(count=500, seed=60)
+    path = sideways(60, 0.05)
+    pair.run(world, path[:30])
+    pair.tracking.reopen()
+    frames = ThegraConfig().relocalization.search_frames
+    pair.run(elsewhere, path[30 : 30 + frames], begin=30)
+    assert [o.result.state for o in pair.outputs[30:]] == [TrackingState.RELOCALIZING] * frames
+    assert all(o.result.world_from_camera is None for o in pair.outputs[30:])
+    assert pair.tracking.losses == 0
+    pair.run(world, path[30 + frames : 40], begin=30 + frames)
+    assert {o.result.state for o in pair.outputs[30 + frames :]} == {TrackingState.TRACKING}
+    pair.tracking.reopen()
+    pair.run(elsewhere, path[40 : 41 + frames], begin=40)
+    assert pair.outputs[-1].result.state is TrackingState.LOST
+    assert pair.tracking.losses == 1
+
+
 def test_frames_without_a_pose_are_placed_afterwards() -> None:
     pair = Pair()
     path = sideways(30, 0.02)
@@ -362,5 +394,13 @@ def test_motion_model_by_hand() -> None:
     model.move(poses.transform(np.eye(3), [0, 10.0, 0]))
     np.testing.assert_allclose(model.predict(1_500_000_000)[:3, 3], [1.5, 10, 0], atol=1e-12)
     np.testing.assert_allclose(model.twist(), [0, 0, 0.4, 1.0, 0, 0], atol=1e-12)
+    assert model.predicted_covariance(2_000_000_000) is None
+    covariance = np.diag([0.0, 0, 3, 4, 5, 6]) * 1e-4
+    model.update(2_000_000_000, model.predict(2_000_000_000), covariance)
+    np.testing.assert_allclose(model.predicted_covariance(2_000_000_000), covariance, atol=1e-12)
+    later = model.predicted_covariance(2_500_000_000)
+    np.testing.assert_allclose(np.diag(later)[2], 3e-4 + 0.2**2, atol=1e-9)
+    np.testing.assert_allclose(np.diag(later)[5], 6e-4 + 0.5**2, atol=1e-9)
+    assert (model.since(2_500_000_000), MotionModel().since(0)) == (0.5, np.inf)
     model.reset()
     assert model.predict(5) is None

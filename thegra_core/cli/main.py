@@ -63,6 +63,7 @@ def thegra(version: Annotated[bool, typer.Option("--version", callback=_print_ve
 def run(
     recording: Annotated[Path, typer.Argument(metavar="INPUT", help="ROS 1 or 2 bag, .mcap, image folder (with images.txt or plain) or video.")],
     topic: Annotated[str | None, typer.Option(help="Image topic; guessed when only one fits.")] = None,
+    shutter_topic: Annotated[str | None, typer.Option(help="Topic of a bag with the camera's own shutter state: a boolean (true: closed) or FLIR's FFC state (2: in progress).")] = None,
     camera: Annotated[str | None, typer.Option(metavar="FILE", help="Camera calibration: ROS, Kalibr or OpenCV yaml, or fx,fy,cx,cy. Default: the recording's own.")] = None,
     profile: Annotated[str | None, typer.Option(help="paper, quality or fast. Default: quality.")] = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with parameters; a run's config.yaml will do.")] = None,
@@ -86,7 +87,7 @@ def run(
     from thegra_core.cli.run import RunOptions, run_recording
 
     options = RunOptions(
-        recording=recording, topic=topic, camera=camera, profile=profile, config=config, assignments=tuple(set_ or ()), out=out,
+        recording=recording, topic=topic, shutter_topic=shutter_topic, camera=camera, profile=profile, config=config, assignments=tuple(set_ or ()), out=out,
         groundtruth=groundtruth, max_frames=max_frames, start_s=start, duration_s=duration, seed=seed, viewer=viewer, quiet=quiet, cache=cache,
     )  # fmt: skip
     raise typer.Exit(run_recording(options))

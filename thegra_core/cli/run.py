@@ -45,6 +45,7 @@ class RunOptions:
 
     recording: Path
     topic: str | None = None
+    shutter_topic: str | None = None
     camera: str | None = None
     profile: str | None = None
     config: Path | None = None
@@ -91,7 +92,7 @@ def run_recording(options: RunOptions) -> int:
     """
     started = datetime.now(timezone.utc)
     config = load_config(options.profile, options.config, _overrides(options))
-    recording = open_recording(options.recording, options.topic)
+    recording = open_recording(options.recording, options.topic, options.shutter_topic)
     camera = camera_for(recording, options.camera)
     groundtruth = _groundtruth(options, recording)
     viewer = make_viewer(options.viewer)

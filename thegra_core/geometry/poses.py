@@ -100,6 +100,14 @@ def apply(a_from_b: FloatArray, points_b: FloatArray) -> FloatArray:
     return np.asarray(points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3])
 
 
+def adjoint(a_from_b: FloatArray) -> FloatArray:
+    """(6, 6), rotation first: carries a small motion of frame b, expressed in b, to the motion of a, expressed in a, that is rigidly tied to it."""
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = a_from_b[:3, :3]
+    result[3:, :3] = skew(a_from_b[:3, 3]) @ a_from_b[:3, :3]
+    return result
+
+
 def interpolate(a_from_b0: FloatArray, a_from_b1: FloatArray, fraction: float) -> FloatArray:
     """Pose `fraction` of the way from the first to the second; beyond [0, 1] it extrapolates (constant velocity)."""
     relative = so3_log(a_from_b0[:3, :3].T @ a_from_b1[:3, :3])

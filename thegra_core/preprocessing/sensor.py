@@ -12,7 +12,7 @@ from thegra_core.messages import ImageArray
 
 FloatImage = NDArray[np.float32]
 
-_ROWS = 32
+_ROWS = 24
 """Rows that are looked at: enough pixels for a weak pattern, few enough for half a millisecond."""
 _EVERY = 4
 """Of those rows' pixels, which take part in medians."""

@@ -16,6 +16,7 @@ from thegra_core.sources.bag_walks import RawMessage
 from thegra_core.sources.calibration import camera_beside, camera_from_info
 from thegra_core.sources.image_decoding import DecodeError, decode_compressed, decode_raw
 from thegra_core.sources.recording import ImageTopic, Source
+from thegra_core.sources.shutter_flag import FLAG_TYPES, shutter_closed
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -29,25 +30,37 @@ class BagRecording(Source):
     """One image topic of a bag; split bags follow each other."""
 
     files: list[BagFile] = field(default_factory=list)
+    shutter_topic: str | None = None
 
     def frames(self) -> Iterator[Frame]:
         """Every image that can be decoded, stamped by its header; what cannot is counted in `problems`."""
         self.problems.clear()
-        index = -1
+        index, closed = -1, None  # type: int, bool | None
+        topics = (str(self.topic), *([self.shutter_topic] if self.shutter_topic else []))
         for file in self.files:
-            for message in file.messages(str(self.topic)):
+            for message in file.messages(*topics):
+                if message.topic == self.shutter_topic:
+                    closed = self._flag(message, closed)
+                    continue
                 index += 1
-                frame = self._frame(message, index)
+                frame = self._frame(message, index, closed)
                 if frame is not None:
                     if frame.stamp_ns == 0:
                         self.note("header stamps are 0: the driver did not fill them in, and without them motion in time is unknown")
                     yield frame
             self.problems.update(file.problems)
 
-    def _frame(self, message: RawMessage, index: int) -> Frame | None:
+    def _flag(self, message: RawMessage, before: bool | None) -> bool | None:
+        try:
+            return shutter_closed(message.decode())
+        except Exception:  # damaged bytes make the deserialiser raise anything
+            self.problems["shutter message cannot be deserialised"] += 1
+            return before
+
+    def _frame(self, message: RawMessage, index: int, closed: bool | None) -> Frame | None:
         try:
             decoded = message.decode()
-            return Frame(header_stamp_ns(decoded), index, decode_message(decoded, message.type))
+            return Frame(header_stamp_ns(decoded), index, decode_message(decoded, message.type), closed)
         except DecodeError as error:
             self.problems[str(error)] += 1
         except Exception:  # damaged bytes make the deserialiser raise anything
@@ -55,8 +68,8 @@ class BagRecording(Source):
         return None
 
 
-def open_bag(path: Path, topic: str | None = None) -> BagRecording:
-    """Open an image topic of a bag; see `open_recording`.
+def open_bag(path: Path, topic: str | None = None, shutter_topic: str | None = None) -> BagRecording:
+    """Open an image topic of a bag, and the topic that tells of the camera's shutter; see `open_recording`.
 
     Raises:
         InputError: If nothing can be read, or the topic is missing or cannot be guessed; the message lists the image topics.
@@ -66,6 +79,8 @@ def open_bag(path: Path, topic: str | None = None) -> BagRecording:
     damage = "".join(f"\n  {file.damage}" for file in files if file.damage)
     picked, why = _pick(topics, topic, path, damage)
     recording = BagRecording(name=path.resolve().stem, path=path, topic=picked.name, frame_count=picked.count, files=files)
+    if shutter_topic is not None:
+        recording.shutter_topic = _shutter_topic(files, shutter_topic, path)
     recording.note(why)
     for file in files:
         if file.damage:
@@ -143,6 +158,15 @@ def _pick(topics: list[ImageTopic], wanted: str | None, path: Path, damage: str)
     if len(guesses) != 1:
         raise InputError(f"{path} has several image topics, say which one:{listing}\ntype: thegra run {path} --topic {_likely(topics).name}")
     return guesses[0], f"topic {guesses[0].name}" + (f", guessed among {len(topics)} image topics" if len(topics) > 1 else "")
+
+
+def _shutter_topic(files: list[BagFile], wanted: str, path: Path) -> str:
+    flags = {topic.name: topic.type for file in files for topic in file.topics if topic.type in FLAG_TYPES}
+    name = "/" + wanted.strip("/")
+    if name not in flags:
+        listing = "".join(f"\n  {flag}  {kind}" for flag, kind in sorted(flags.items())) or " none"
+        raise InputError(f"{path} has no topic {wanted!r} of a boolean or a whole number, as a shutter's state is; such topics are:{listing}")
+    return name
 
 
 def _guess(topics: list[ImageTopic]) -> list[ImageTopic]:

@@ -40,23 +40,23 @@ class BagFile:
     walk: Walk | None = None
     problems: Counter[str] = field(default_factory=Counter)
 
-    def messages(self, topic: str) -> Iterator[RawMessage]:
-        """The messages of a topic in the file's order; where the file breaks off, the reason is counted in `problems`."""
+    def messages(self, *topics: str) -> Iterator[RawMessage]:
+        """The messages of some topics in the file's order; where the file breaks off, the reason is counted in `problems`."""
         self.problems.clear()
         if self.damage:
             self.problems[self.damage] += 1
-        stream = self._indexed(topic) if self.walk is None else (m for m in self.walk(self.path) if m.topic == topic)
+        stream = self._indexed(topics) if self.walk is None else (m for m in self.walk(self.path) if m.topic in topics)
         try:
             yield from stream
         except Exception as error:  # what is damaged decides what the libraries raise
             self.problems[f"{self.path.name} breaks off: {_reason(error)}"] += 1
 
-    def _indexed(self, topic: str) -> Iterator[RawMessage]:
+    def _indexed(self, topics: tuple[str, ...]) -> Iterator[RawMessage]:
         with _reader(self.path) as reader:
-            connections = [c for c in reader.connections if c.topic == topic]
+            connections = [c for c in reader.connections if c.topic in topics]
             if connections:
                 for connection, _, data in reader.messages(connections):
-                    yield RawMessage(topic, connection.msgtype, bytes(data), isinstance(reader, rosbag1.Reader))
+                    yield RawMessage(connection.topic, connection.msgtype, bytes(data), isinstance(reader, rosbag1.Reader))
 
 
 def is_bag(path: Path) -> bool:

@@ -17,21 +17,23 @@ from thegra_core.sources.video import open_video
 FORMS = "a ROS 1 .bag, a rosbag2 folder, an .mcap or .db3 file, a folder with images.txt or images, or a video"
 
 
-def open_recording(path: Path | str, topic: str | None = None) -> Recording:
+def open_recording(path: Path | str, topic: str | None = None, shutter_topic: str | None = None) -> Recording:
     """Open a recording: ROS 1 bag, rosbag2 folder, mcap or db3 file, image folder, or video.
 
     Args:
         path: The file or folder.
         topic: Image topic of a bag; guessed when only one fits.
+        shutter_topic: Topic of a bag by which the camera tells whether its shutter is closed (`shutter_flag`).
 
     Raises:
         InputError: If the path holds no recording or the topic is missing; the message lists the topics there are.
     """
     path = _existing(path)
     if _holds_bag(path):
-        return open_bag(path, topic)
-    if topic is not None:
-        raise InputError(f"--topic {topic} is given but {path} is no bag and has no topics; leave it out")
+        return open_bag(path, topic, shutter_topic)
+    for option, value in (("--topic", topic), ("--shutter-topic", shutter_topic)):
+        if value is not None:
+            raise InputError(f"{option} {value} is given but {path} is no bag and has no topics; leave it out")
     if path.is_dir():
         image_list = find_list(path)
         return open_list(image_list) if image_list is not None else open_images(path)

@@ -16,14 +16,16 @@ class MotionModel:
     def __init__(self) -> None:
         self._previous: tuple[int, FloatArray] | None = None
         self._last: tuple[int, FloatArray] | None = None
+        self._covariance: FloatArray | None = None
 
-    def update(self, stamp_ns: int, world_from_camera: FloatArray) -> None:
-        """Add an estimated pose (4, 4); stamps must ascend."""
+    def update(self, stamp_ns: int, world_from_camera: FloatArray, covariance: FloatArray | None = None) -> None:
+        """Add an estimated pose (4, 4) and its covariance (6, 6), rotation first, in the camera frame; stamps must ascend."""
         self._previous, self._last = self._last, (stamp_ns, world_from_camera)
+        self._covariance = covariance
 
     def reset(self) -> None:
         """Forget all poses."""
-        self._previous = self._last = None
+        self._previous = self._last = self._covariance = None
 
     def move(self, new_world_from_world: FloatArray) -> None:
         """The world was corrected: carry the remembered poses along with a rigid transform (4, 4)."""
@@ -40,6 +42,21 @@ class MotionModel:
             return self._last[1]
         fraction = (stamp_ns - self._previous[0]) / (self._last[0] - self._previous[0])
         return poses.interpolate(self._previous[1], self._last[1], fraction)
+
+    def predicted_covariance(self, stamp_ns: int) -> FloatArray | None:
+        """Covariance (6, 6) of `predict`: that of the last pose, carried along, and a standard deviation of all the motion since, for the camera may have
+        stopped. None without a last covariance or a velocity."""
+        twist, predicted = self.twist(), self.predict(stamp_ns)
+        if self._last is None or self._covariance is None or twist is None or predicted is None:
+            return None
+        carried = poses.adjoint(poses.inverse(predicted) @ self._last[1])
+        motion = (stamp_ns - self._last[0]) / 1e9 * twist
+        deviation = np.repeat([np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])], 3)
+        return np.asarray(carried @ self._covariance @ carried.T + np.diag(deviation**2))
+
+    def since(self, stamp_ns: int) -> float:
+        """Seconds from the last pose to a stamp; infinite without one."""
+        return np.inf if self._last is None else (stamp_ns - self._last[0]) / 1e9
 
     def twist(self) -> FloatArray | None:
         """Angular (rad/s) and linear (map units/s) velocity (6,) in the camera frame between the last two poses."""

@@ -62,6 +62,7 @@ class _Place:
     last_keyframe_id: int
     probation: int
     lost_frames: int = 0
+    search_frames: int = 0
     motion: MotionModel = field(default_factory=MotionModel)
     visible: list[IntArray] = field(default_factory=list)
     found: list[IntArray] = field(default_factory=list)
@@ -123,12 +124,21 @@ class TrackingStage:
         return self._accept(place, features, found, matches)
 
     def hold(self, stamp_ns: int, reason: str) -> TrackingOutput:
-        """A frame that shows nothing (shutter closed): the pose is predicted, and marked as that."""
+        """A frame that shows nothing (shutter closed): the pose is predicted, and marked as that; not for longer than a closure can last."""
         place = self._place
-        if place is None or place.probation:
+        if place is None or place.probation or place.motion.since(stamp_ns) > self._config.preprocessing.shutter.longest_s:
             return TrackingOutput(TrackingResult(stamp_ns, TrackingState.HOLD, reason=reason))
         predicted = place.predict(stamp_ns)
-        return TrackingOutput(TrackingResult(stamp_ns, TrackingState.HOLD, predicted, map_id=self.map_id, reference_id=place.reference_id, reason=reason))
+        covariance = place.motion.predicted_covariance(stamp_ns) if predicted is not None else None
+        result = TrackingResult(
+            stamp_ns, TrackingState.HOLD, predicted, covariance, map_id=self.map_id, reference_id=place.reference_id, reason=reason
+        )  # fmt: skip
+        return TrackingOutput(result)
+
+    def reopen(self) -> None:
+        """The camera sees again after a time that it did not: until it is found, or `search_frames` have passed, it counts as sought for, not as lost."""
+        if self._place is not None and self._place.lost_frames == 0:
+            self._place.search_frames = self._config.relocalization.search_frames
 
     def apply(self, update: MapUpdate) -> None:
         """Bring the replica up to date; the newest keyframe becomes the reference and the motion model follows its correction.
@@ -202,9 +212,10 @@ class TrackingStage:
             place.lost_frames = 0
             self.relocalizations += 1
             place.motion.reset()
+        place.search_frames = 0
         place.probation = max(0, place.probation - 1)
         world_from_camera = found.world_from_camera
-        place.motion.update(features.stamp_ns, world_from_camera)
+        place.motion.update(features.stamp_ns, world_from_camera, found.covariance)
         place.visible.append(found.visible_ids)
         place.found.append(found.landmark_ids[found.landmark_ids >= 0])
         matched_to = place.reference_id
@@ -252,12 +263,17 @@ class TrackingStage:
             output = self._start(features, None) if self._place is None else self._stay_lost(self._place, features, reason)
             return replace(output, dropped_map_id=dropped)
         settings = self._config.relocalization
-        candidates = last_keyframes(place.map, place.reference_id, settings.keyframes)
+        candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
         least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
         found = relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
         if found is not None:
             place.reference_id = found[1]
             return self._accept(place, features, found[0], found[2])
+        if place.search_frames:
+            place.search_frames -= 1
+            self._unplaced.append(features)
+            result = TrackingResult(features.stamp_ns, TrackingState.RELOCALIZING, keypoints=len(features), map_id=place.map.map_id, reason=reason)
+            return TrackingOutput(result)
         return self._stay_lost(place, features, reason)
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
