@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
-from thegra_core.features.fixed_pattern import FixedPatternMask
 from thegra_core.features.protocols import Extractor, Matcher
 from thegra_core.features.registry import make_extractor, make_matcher
 from thegra_core.geometry.camera import CameraModel
@@ -22,6 +21,7 @@ from thegra_core.messages import Features, Frame, FrameRecord, Run, Shutter, Shu
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
 from thegra_core.snapshots import SnapshotKeeper
+from thegra_core.tracking.fixed_pattern import FixedPatternMask
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
 
 FloatArray = NDArray[np.float64]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from thegra_core.config import ExtractorConfig, MatcherConfig
-from thegra_core.features.fixed_pattern import SIGHTINGS, FixedPatternMask, still_in_motion
 from thegra_core.features.registry import make_extractor, make_matcher
 from thegra_core.messages import Features, Matches
+from thegra_core.tracking.fixed_pattern import SIGHTINGS, FixedPatternMask, still_in_motion
 
 SIZE = (320, 240)
 SPOTS = np.array([[40.0, 60.0], [200.0, 100.0], [300.0, 200.0]])

@@ -268,6 +268,19 @@ def test_filters_keep_shape_and_input(section, dtype, seed, height, width):
 
 @pytest.mark.parametrize("section", EVERY_FILTER, ids=lambda s: s.filter)
 @pytest.mark.parametrize("dtype", DTYPES)
+def test_padded_rows_and_byte_order_make_no_difference(section, dtype):
+    image = (thermal() - 2800).astype(dtype)
+    padded = np.full((len(image), image.shape[1] + 13), 99, dtype)
+    padded[:, : image.shape[1]] = image
+    view = padded[:, : image.shape[1]]
+    np.testing.assert_array_equal(apply(section, view), apply(section, image))
+    chain = Chain(PreprocessingConfig(filters=(section, cfg.HistogramClip())))
+    swapped = view.astype(view.dtype.newbyteorder(">"))
+    np.testing.assert_array_equal(chain(swapped, 0), chain(image, 0))
+
+
+@pytest.mark.parametrize("section", EVERY_FILTER, ids=lambda s: s.filter)
+@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("value", [0, 7, 255])
 def test_constant_images_pass_without_a_word(section, dtype, value):
     image = np.full((48, 40), value, dtype)

@@ -50,8 +50,8 @@ class Chain:
         self.reset()
 
     def __call__(self, image: ImageArray, stamp_ns: int) -> NDArray[np.uint8]:
-        """(H, W) uint8, uint16 or float32 to (H, W) uint8."""
-        result = image
+        """(H, W) uint8, uint16 or float32, of any byte order and strides, to (H, W) uint8."""
+        result = np.ascontiguousarray(image, dtype=image.dtype.newbyteorder("="))
         for step in self._steps:
             result = step(result, stamp_ns)
         if result.dtype != np.uint8:
