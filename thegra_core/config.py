@@ -294,6 +294,22 @@ class RelocalizationConfig(Section):
     new_map_after_frames: int = Field(5, ge=1, description="frames lost before a new map is begun beside the old one")
 
 
+class LoopConfig(Section):
+    """Places that are seen again, and what that does to the map."""
+
+    enabled: bool = Field(True, description="close loops; the paper does not")
+    vocabulary_keyframes: int = Field(5, ge=1, description="first keyframes of a map, of whose descriptors the words are made")
+    words: int = Field(64, ge=4, description="words of the vocabulary")
+    similarity_share: float = Field(0.8, gt=0, description="of the similarity to keyframes that see the same: what a candidate must look alike")
+    group: int = Field(3, ge=1, description="keyframes of the old place that the new one is matched to: the candidate and its best neighbours")
+    min_matches: int = Field(40, ge=6, description="matches to the candidate alone")
+    min_inliers: int = Field(40, ge=6, description="landmarks of the old place that must agree with one pose of the new keyframe")
+    min_scale_pairs: int = Field(10, ge=3, description="landmarks of both places that are the same points: they tell the scale")
+    max_scale_spread: float = Field(0.1, gt=0, description="median deviation of the logarithm of their depths' ratio")
+    max_rotation_deg: float = Field(3.0, gt=0, description="degrees by which a second keyframe may place the loop otherwise")
+    max_translation_ratio: float = Field(0.1, gt=0, description="the same in position, over the median depth")
+
+
 class ThegraConfig(Section):
     """The whole configuration; `config.yaml` of a run holds exactly this."""
 
@@ -309,6 +325,7 @@ class ThegraConfig(Section):
     keyframe: KeyframeConfig = KeyframeConfig()
     mapping: MappingConfig = MappingConfig()
     bundle: BundleConfig = BundleConfig()
+    loop: LoopConfig = LoopConfig()
     relocalization: RelocalizationConfig = RelocalizationConfig()
 
 

@@ -140,6 +140,7 @@ class Slam:
             main_map_id=max(counts, key=lambda i: (counts[i], -i)) if counts else -1,
             shutter_closures_ns=tuple(self._closures),
             losses=self._tracking.losses,
+            loops=self._mapper.loops,
             relocalizations=self._tracking.relocalizations,
             bad_frames=dict(self._bad),
             snapshots=self._snapshots.kept(),

@@ -404,3 +404,29 @@ def test_motion_model_by_hand() -> None:
     assert (model.since(2_500_000_000), MotionModel().since(0)) == (0.5, np.inf)
     model.reset()
     assert model.predict(5) is None
+
+
+# ---- loops ---------------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_place_seen_again_takes_the_drift_out() -> None:
+    path = loop(140, radius=1.5, turns=1.2)
+    errors = {}
+    for enabled in (False, True):
+        config = CONFIG.model_copy(update={"loop": CONFIG.loop.model_copy(update={"enabled": enabled})})
+        pair = Pair(config, FakeMatcher(wrong=0.05))
+        pair.run(room(count=3000, seed=12), path, noise_px=1.0)
+        assert pair.tracking.map_id == 0
+        assert (pair.mapper.loops > 0) == enabled
+        keyframes = pair.mapper.map(0).keyframes
+        rows = [i for i in range(len(path)) if any(k.stamp_ns == stamp(i) for k in keyframes.values())]
+        found = np.array([next(k.center for k in keyframes.values() if k.stamp_ns == stamp(i)) for i in rows])
+        true = np.array([path[i][:3, 3] for i in rows])
+        scale, rotation, translation = umeyama(found, true)
+        errors[enabled] = np.sqrt(((scale * found @ rotation.T + translation - true) ** 2).sum(axis=1).mean())
+        replica, original = pair.tracking._place.map, pair.mapper.map(0)
+        assert replica.keyframes.keys() == original.keyframes.keys()
+        for i, keyframe in original.keyframes.items():
+            np.testing.assert_array_equal(replica.keyframes[i].world_from_camera, keyframe.world_from_camera)
+            np.testing.assert_array_equal(replica.keyframes[i].landmark_ids, keyframe.landmark_ids)
+    assert errors[True] < 0.6 * errors[False]

@@ -15,6 +15,7 @@ from thegra_core.mapping import culling
 from thegra_core.mapping.adjustment import adjust_all, adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
 from thegra_core.mapping.expansion import expand
+from thegra_core.mapping.loop_closing import LoopCloser
 from thegra_core.messages import InitialMap, Keyframe, MapSummary, MapUpdate, Matches
 
 logger = logging.getLogger(__name__)
@@ -30,6 +31,7 @@ class Mapper:
         self._editors: dict[int, MapEditor] = {}
         self._trial: dict[int, list[int]] = {}
         self._graphs: dict[int, MatchGraph] = {}
+        self._loops: dict[int, LoopCloser] = {}
 
     def initialize(self, initial: InitialMap) -> MapUpdate:
         """Begin a map from what the initializer solved; its bundle adjustment has been done."""
@@ -46,6 +48,9 @@ class Mapper:
             editor.connect(message.id)
         self._trial[initial.map_id] = []
         self._graphs[initial.map_id] = MatchGraph()
+        self._loops[initial.map_id] = LoopCloser(self._config, self._matcher)
+        for message in initial.keyframes:
+            self._loops[initial.map_id].index.add(message.id, message.features)
         for message in initial.keyframes:
             if message.reference_matches is not None:
                 self._graphs[initial.map_id].add(message.id, message.reference_id, message.reference_matches)
@@ -62,6 +67,8 @@ class Mapper:
         editor.connect(keyframe.id)
         adjust_locally(editor, keyframe.id, self._config)
         editor.connect(keyframe.id)
+        if self._config.loop.enabled:
+            self._loops[keyframe.map_id].add(editor, keyframe.id, self._graphs[keyframe.map_id])
         return editor.take_update()
 
     def finish(self, map_id: int) -> MapUpdate:
@@ -72,7 +79,12 @@ class Mapper:
 
     def drop(self, map_id: int) -> None:
         """Forget a map that tracking has given up."""
-        del self._editors[map_id], self._trial[map_id], self._graphs[map_id]
+        del self._editors[map_id], self._trial[map_id], self._graphs[map_id], self._loops[map_id]
+
+    @property
+    def loops(self) -> int:
+        """Loops closed in all maps."""
+        return sum(loops.closed for loops in self._loops.values())
 
     @property
     def map_ids(self) -> list[int]:

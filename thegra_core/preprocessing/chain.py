@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,7 @@ class Chain:
 
     def __call__(self, image: ImageArray, stamp_ns: int) -> NDArray[np.uint8]:
         """(H, W) uint8, uint16 or float32, of any byte order and strides, to (H, W) uint8."""
-        result = np.ascontiguousarray(image, dtype=image.dtype.newbyteorder("="))
+        result = cast(ImageArray, np.ascontiguousarray(image, dtype=image.dtype.newbyteorder("=")))
         for step in self._steps:
             result = step(result, stamp_ns)
         if result.dtype != np.uint8:

@@ -1,0 +1,131 @@
+"""Loops: a place seen again ties the map's newest part to an old one, and what has drifted between is set right."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from thegra_core.config import ThegraConfig
+from thegra_core.features.protocols import Matcher
+from thegra_core.geometry.similarity import Similarity
+from thegra_core.map.editor import MapEditor
+from thegra_core.mapping.adjustment import adjust_all
+from thegra_core.mapping.chaining import MatchGraph
+from thegra_core.messages import NO_LANDMARK
+from thegra_core.optimization.pose_graph import Edge, optimize_pose_graph
+from thegra_core.places.index import PlaceIndex
+from thegra_core.places.verification import Sighting, agree, sight
+
+logger = logging.getLogger(__name__)
+ESSENTIAL_NEIGHBOURS = 5
+"""Best neighbours of a keyframe whose edges carry the pose graph."""
+
+
+@dataclass
+class LoopCloser:
+    """Looks for loops of one map, keyframe by keyframe, and closes them.
+
+    A loop takes two keyframes: one waits until the next that sees the same old place moves the map alike.
+    """
+
+    config: ThegraConfig
+    matcher: Matcher
+    index: PlaceIndex = field(init=False)
+    closed: int = 0
+    _waiting: Sighting | None = None
+
+    def __post_init__(self) -> None:
+        self.index = PlaceIndex(self.config.loop, self.config.seed)
+
+    def add(self, editor: MapEditor, keyframe_id: int, graph: MatchGraph) -> bool:
+        """Take a keyframe that mapping has finished with; True if it closed a loop."""
+        self.index.add(keyframe_id, editor.map.keyframes[keyframe_id].features)
+        sighting = self._find(editor, keyframe_id)
+        before, self._waiting = self._waiting, sighting
+        if before is None or sighting is None or not agree(editor.map, before, sighting, self.config):
+            return False
+        _close(editor, [before, sighting], graph, self.config)
+        self._waiting = None
+        self.closed += 1
+        return True
+
+    def _find(self, editor: MapEditor, keyframe_id: int) -> Sighting | None:
+        current = editor.map
+        direct = current.neighbours(keyframe_id, len(current.keyframes))
+        connected = list(dict.fromkeys([*direct, *(second for first in direct for second in current.neighbours(first, len(current.keyframes)))]))
+        for candidate in self.index.candidates(keyframe_id, connected)[:1]:
+            near = [i for i in current.neighbours(candidate, len(current.keyframes)) if i not in connected]
+            found = sight(current, keyframe_id, [candidate, *near[: self.config.loop.group - 1]], self.matcher, self.config)
+            if isinstance(found, Sighting):
+                return found
+            logger.debug("keyframe %d looks like %d: %s", keyframe_id, candidate, found)
+        return None
+
+
+def _close(editor: MapEditor, sightings: list[Sighting], graph: MatchGraph, config: ThegraConfig) -> None:
+    current = editor.map
+    before = {i: Similarity(keyframe.world_from_camera) for i, keyframe in current.keyframes.items()}
+    depth = current.median_depth(sightings[-1].keyframe_id)
+    after = optimize_pose_graph(before, _edges(editor, before, sightings), min(before), depth)
+    _move(editor, before, after)
+    for sighting in sightings:
+        for other, matches in sighting.matches.items():
+            graph.add(sighting.keyframe_id, other, matches)
+        _fuse(editor, sighting)
+    concerned = {i for sighting in sightings for i in (sighting.keyframe_id, *sighting.matches)}
+    for keyframe_id in sorted(concerned | {n for i in concerned for n in current.neighbours(i, ESSENTIAL_NEIGHBOURS)}):
+        editor.connect(keyframe_id)
+    adjust_all(editor, config)
+    last = sightings[-1]
+    moved = np.linalg.norm(current.keyframes[last.keyframe_id].center - before[last.keyframe_id].rigid[:3, 3]) / depth
+    logger.info(
+        "loop closed: keyframe %d sees what keyframe %d saw, by %d landmarks; it moves by %.3f of the scene's depth, scale %.3f",
+        last.keyframe_id, next(iter(last.matches)), len(last.keypoints), moved, last.world_from_camera.scale,
+    )  # fmt: skip
+
+
+def _edges(editor: MapEditor, world_from: dict[int, Similarity], sightings: list[Sighting]) -> list[Edge]:
+    """The map's best edges as they are, and those of the sightings as they should be."""
+    pairs = {
+        (min(i, other), max(i, other)) for i in world_from for other in editor.map.neighbours(i, ESSENTIAL_NEIGHBOURS) if other in world_from
+    }  # fmt: skip
+    ordered = sorted(world_from)
+    pairs |= set(pairwise(ordered))
+    edges = [Edge(a, b, world_from[a].inverse() @ world_from[b]) for a, b in sorted(pairs)]
+    for sighting in sightings:
+        edges += [Edge(other, sighting.keyframe_id, world_from[other].inverse() @ sighting.world_from_camera) for other in sighting.matches]
+    return edges
+
+
+def _move(editor: MapEditor, before: dict[int, Similarity], after: dict[int, Similarity]) -> None:
+    """Carry poses, and each landmark with the keyframe that saw it first."""
+    current = editor.map
+    ids = current.landmarks.alive_ids()
+    points = current.landmarks.points_world[current.landmarks.rows(ids)].copy()
+    carriers = np.array([_carrier(editor, i) for i in ids.tolist()], dtype=np.int64)
+    for carrier in np.unique(carriers).tolist():
+        mine = carriers == carrier
+        points[mine] = (after[carrier] @ before[carrier].inverse()).apply(points[mine])
+    keyframes = np.array(sorted(after), dtype=np.int64)
+    editor.move(keyframes, np.stack([after[i].rigid for i in keyframes.tolist()]), ids, points)
+
+
+def _carrier(editor: MapEditor, landmark: int) -> int:
+    first = editor.first_keyframe[landmark]
+    return first if first in editor.map.keyframes else min(editor.observers[landmark])
+
+
+def _fuse(editor: MapEditor, sighting: Sighting) -> None:
+    """The old landmarks take the place of the new ones."""
+    own = editor.map.keyframes[sighting.keyframe_id].landmark_ids
+    for keypoint, old in zip(sighting.keypoints.tolist(), sighting.landmarks.tolist(), strict=True):
+        new = int(own[keypoint])
+        if old not in editor.observers:
+            continue
+        if new == NO_LANDMARK:
+            editor.observe(old, sighting.keyframe_id, keypoint)
+        else:
+            editor.fuse(old, new)

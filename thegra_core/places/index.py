@@ -1,0 +1,69 @@
+"""The places of a map, found again by what they look like."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thegra_core.config import LoopConfig
+from thegra_core.messages import Features
+from thegra_core.places.descriptor import describe, learn_vocabulary
+
+FloatArray = NDArray[np.float32]
+
+
+class PlaceIndex:
+    """Keyframes by their image's vector. The vocabulary is learnt from the first keyframes of the map; until then nothing is found."""
+
+    def __init__(self, config: LoopConfig, seed: int) -> None:
+        self._config = config
+        self._seed = seed
+        self._waiting: dict[int, Features] = {}
+        self._vocabulary: FloatArray | None = None
+        self._ids: list[int] = []
+        self._vectors = np.empty((0, 0), np.float32)
+
+    def add(self, keyframe_id: int, features: Features) -> None:
+        """Take a keyframe."""
+        if self._vocabulary is None:
+            self._waiting[keyframe_id] = features
+            if len(self._waiting) < self._config.vocabulary_keyframes or sum(map(len, self._waiting.values())) < self._config.words:
+                return
+            self._vocabulary = learn_vocabulary(list(self._waiting.values()), self._config.words, self._seed)
+            for waiting_id, waiting in self._waiting.items():
+                self._append(waiting_id, waiting)
+            self._waiting.clear()
+            return
+        self._append(keyframe_id, features)
+
+    def similarity(self, keyframe_id: int) -> dict[int, float]:
+        """Cosine of every keyframe's vector with that of one of them; empty while there is no vocabulary."""
+        if keyframe_id not in self._ids:
+            return {}
+        known = self._vectors[: len(self._ids)]
+        return dict(zip(self._ids, (known @ known[self._ids.index(keyframe_id)]).tolist(), strict=True))
+
+    def candidates(self, keyframe_id: int, connected: Sequence[int]) -> list[int]:
+        """Keyframes that look nearly as much like this one as those do that see the same, the most similar first.
+
+        connected: ids that are no news, those that share most with it first; the first five set the bar.
+        """
+        similar = self.similarity(keyframe_id)
+        near = [similar[i] for i in connected if i in similar and i != keyframe_id][:5]
+        if not near:
+            return []
+        bar = self._config.similarity_share * float(np.median(near))
+        found = [(value, i) for i, value in similar.items() if value >= bar and i != keyframe_id and i not in connected]
+        return [i for _, i in sorted(found, reverse=True)]
+
+    def _append(self, keyframe_id: int, features: Features) -> None:
+        assert self._vocabulary is not None
+        vector = describe(features, self._vocabulary)
+        if len(self._ids) == len(self._vectors):
+            grown = np.zeros((max(64, 2 * len(self._vectors)), len(vector)), np.float32)
+            grown[: len(self._ids)] = self._vectors.reshape(len(self._ids), -1) if self._ids else 0.0
+            self._vectors = grown
+        self._vectors[len(self._ids)] = vector
+        self._ids.append(keyframe_id)

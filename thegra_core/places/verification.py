@@ -1,0 +1,107 @@
+"""Whether two keyframes that look alike see the same place: by matches, a pose, and the scale that both give it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thegra_core.config import ThegraConfig
+from thegra_core.features.protocols import Matcher
+from thegra_core.geometry import poses
+from thegra_core.geometry.similarity import Similarity
+from thegra_core.map.map import Map, MapKeyframe
+from thegra_core.messages import Matches
+from thegra_core.optimization.pose import estimate_pose, refine_pose
+from thegra_core.optimization.weighting import observation_weights
+
+IntArray = NDArray[np.int64]
+RANSAC_THRESHOLD_PX = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """A keyframe placed by an old part of its map: where it should be, (old units per new unit as scale), and by what.
+
+    keypoints (M,) of the keyframe see landmarks (M,) of the old place; matches maps the old keyframes to the matches with them.
+    """
+
+    keyframe_id: int
+    world_from_camera: Similarity
+    keypoints: IntArray
+    landmarks: IntArray
+    matches: Mapping[int, Matches]
+
+
+def sight(current: Map, keyframe_id: int, group: list[int], matcher: Matcher, config: ThegraConfig) -> Sighting | str:
+    """Place a keyframe by the landmarks of `group`, the candidate first; a string says why that failed."""
+    settings = config.loop
+    keyframe = current.keyframes[keyframe_id]
+    first = matcher.match(keyframe.features, current.keyframes[group[0]].features)
+    if len(first) < settings.min_matches:
+        return f"{len(first)} matches"
+    others = matcher.match_many(keyframe.features, [current.keyframes[i].features for i in group[1:]])
+    matched = dict(zip(group, [first, *others], strict=True))
+    keypoints, landmarks = _old_landmarks(current, keyframe, matched)
+    if len(keypoints) < settings.min_inliers:
+        return f"{len(keypoints)} matches with landmarks"
+    points = current.landmarks.points_world[current.landmarks.rows(landmarks)]
+    focal = current.camera.focal
+    start, found = estimate_pose(points, keyframe.normalized[keypoints], focal, RANSAC_THRESHOLD_PX, config.seed)
+    if found < settings.min_inliers:
+        return f"{found} inliers of {len(keypoints)} matches with landmarks"
+    weights = observation_weights(keyframe.features.scores, config.weighting)[keypoints]
+    estimate = refine_pose(start, points, keyframe.normalized[keypoints], focal, weights, config.tracking.chi2_px2)
+    keypoints, landmarks, points = keypoints[estimate.inliers], landmarks[estimate.inliers], points[estimate.inliers]
+    if len(keypoints) < settings.min_inliers:
+        return f"{len(keypoints)} landmarks agree with one pose"
+    scale = _scale(current, keyframe, keypoints, poses.apply(estimate.camera_from_world, points)[:, 2], config)
+    if isinstance(scale, str):
+        return scale
+    return Sighting(keyframe_id, Similarity(poses.inverse(estimate.camera_from_world), scale), keypoints, landmarks, matched)
+
+
+def agree(current: Map, one: Sighting, other: Sighting, config: ThegraConfig) -> bool:
+    """Whether two keyframes of the new part are moved alike by their sightings of the old one."""
+    settings = config.loop
+    correction = one.world_from_camera @ Similarity(current.keyframes[one.keyframe_id].world_from_camera).inverse()
+    expected = correction @ Similarity(current.keyframes[other.keyframe_id].world_from_camera)
+    difference = expected.inverse() @ other.world_from_camera
+    depth = current.median_depth(other.keyframe_id)
+    return bool(
+        np.degrees(poses.rotation_angle(difference.rigid[:3, :3])) <= settings.max_rotation_deg
+        and float(np.linalg.norm(difference.rigid[:3, 3])) <= settings.max_translation_ratio * depth
+        and abs(np.log(difference.scale)) <= settings.max_scale_spread
+    )
+
+
+def _old_landmarks(current: Map, keyframe: MapKeyframe, matched: Mapping[int, Matches]) -> tuple[IntArray, IntArray]:
+    """Keypoints (M,) and the old landmarks (M,) that they match, one to one, the most confident match first."""
+    keypoints, ids, confidence = [], [], []
+    defined = np.asarray(np.isfinite(keyframe.normalized).all(axis=1))
+    for other, matches in matched.items():
+        inherited = current.keyframes[other].landmark_ids[matches.indices[:, 1]]
+        use = (current.landmarks.rows(inherited) >= 0) & defined[matches.indices[:, 0]]
+        keypoints.append(matches.indices[use, 0].astype(np.int64))
+        ids.append(inherited[use])
+        confidence.append(matches.confidence[use])
+    all_keypoints, all_ids = np.concatenate(keypoints), np.concatenate(ids)
+    order = np.argsort(-np.concatenate(confidence), kind="stable")
+    for key in (all_keypoints, all_ids):
+        order = order[np.sort(np.unique(key[order], return_index=True)[1])]
+    return all_keypoints[order], all_ids[order]
+
+
+def _scale(current: Map, keyframe: MapKeyframe, keypoints: IntArray, old_depth: NDArray[np.float64], config: ThegraConfig) -> float | str:
+    """Old over new depth of the keypoints that have a landmark in both parts."""
+    rows = current.landmarks.rows(keyframe.landmark_ids[keypoints])
+    new_depth = poses.apply(keyframe.camera_from_world, current.landmarks.points_world[np.maximum(rows, 0)])[:, 2]
+    use = (rows >= 0) & (new_depth > 0) & (old_depth > 0)
+    if use.sum() < config.loop.min_scale_pairs:
+        return f"{int(use.sum())} landmarks of both places"
+    ratio = np.log(old_depth[use] / new_depth[use])
+    middle = float(np.median(ratio))
+    spread = float(np.median(np.abs(ratio - middle)))
+    return float(np.exp(middle)) if spread <= config.loop.max_scale_spread else f"scales differ by {100 * spread:.0f} %"
