@@ -178,7 +178,8 @@ class MapUpdate:
 
     `new_keyframes` carry their features; `keyframes` restate pose and landmark ids of each keyframe that changed (the new ones too);
     `landmarks` restate each landmark that is new or changed; `correction` is the Sim(3) (4x4 with scale in the rotation block)
-    that moved the world under tracking, None where the world stayed.
+    that moved the world under tracking, None where the world stayed; `scales` tells by what factor the surroundings of keyframes grew, where
+    a loop changed their scale.
     """
 
     version: int
@@ -190,6 +191,7 @@ class MapUpdate:
     removed_landmark_ids: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     covisibility: Mapping[int, tuple[tuple[int, int], ...]] = field(default_factory=dict)  # keyframe id -> ((keyframe id, shared points), ...)
     correction: FloatArray | None = None
+    scales: Mapping[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from thegra_core.features.registry import make_extractor, make_matcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
-from thegra_core.messages import Features, Frame, FrameRecord, Run, Shutter, ShutterState, Snapshot, TrackingResult, TrackingState
+from thegra_core.messages import Features, Frame, FrameRecord, MapUpdate, Run, Shutter, ShutterState, Snapshot, TrackingResult, TrackingState
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
 from thegra_core.snapshots import SnapshotKeeper
@@ -167,7 +167,9 @@ class Slam:
             if output.initial_map is not None:
                 self._tracking.apply(self._mapper.initialize(output.initial_map))
             elif output.keyframe is not None:
-                self._tracking.apply(self._mapper.insert(output.keyframe))
+                update = self._mapper.insert(output.keyframe)
+                self._tracking.apply(update)
+                self._rescale(update)
         self._view = lambda: _snapshot(frame, image, features, output, reference)
         self._snapshots.offer(frame.index, self._view)
         return output
@@ -208,6 +210,16 @@ class Slam:
         reference = self._mapper.map(placed.map_id).keyframes[placed.reference_id]
         relative = np.eye(4) if placed.is_keyframe else reference.camera_from_world @ placed.world_from_camera
         self._frames.append(_Placed(result, index, placed.map_id, placed.reference_id, relative, afterwards=provisional is not None))
+
+    def _rescale(self, update: MapUpdate) -> None:
+        """Frames keep their place beside their keyframe when a loop changes the scale there."""
+        if not update.scales:
+            return
+        for row, placed in enumerate(self._frames):
+            if placed.map_id == update.map_id and placed.reference_from_camera is not None:
+                relative = placed.reference_from_camera.copy()
+                relative[:3, 3] *= update.scales.get(placed.reference_id, 1.0)
+                self._frames[row] = replace(placed, reference_from_camera=relative)
 
     def _drop(self, map_id: int) -> None:
         """Forget a map and the places of frames in it."""

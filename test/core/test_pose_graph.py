@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -29,7 +31,7 @@ def test_similarities_compose_and_invert(a_from_b, b_from_c, point):
 def circle(count=24, drift=1.0):
     """A square-ish round trip, and what odometry makes of it when every step is `drift` times as long as the one before."""
     truth = [Similarity(poses.transform(poses.so3_exp([0, a, 0]), [4 * np.sin(a), 0, 4 * np.cos(a)])) for a in np.linspace(0, 2 * np.pi, count)]
-    steps = [first.inverse() @ second for first, second in zip(truth, truth[1:], strict=False)]
+    steps = [first.inverse() @ second for first, second in pairwise(truth)]
     scaled = [Similarity(step.rigid, drift) for step in steps]
     odometry = [truth[0]]
     for step in scaled:

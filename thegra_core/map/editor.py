@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,7 @@ class MapEditor:
         self._landmarks: set[int] = set()
         self._removed: set[int] = set()
         self._edges: set[int] = set()
+        self._scales: dict[int, float] = {}
 
     # ---- changes --------------------------------------------------------------------------------------------------------------------
 
@@ -128,6 +129,11 @@ class MapEditor:
         rows = self.map.landmarks.rows(landmark_ids)
         self.map.landmarks.points_world[rows[rows >= 0]] = points_world[rows >= 0]
         self._landmarks.update(landmark_ids[rows >= 0].tolist())
+
+    def rescale(self, scales: Mapping[int, float]) -> None:
+        """Tell replicas by what factor the surroundings of keyframes have grown (a loop's scale drift taken out)."""
+        for keyframe_id, scale in scales.items():
+            self._scales[keyframe_id] = self._scales.get(keyframe_id, 1.0) * scale
 
     def place(self, landmark: int, point_world: FloatArray) -> None:
         """Set the position (3,) of one landmark."""
@@ -226,8 +232,9 @@ class MapEditor:
             removed_landmark_ids=np.array(sorted(self._removed), dtype=np.int64),
             covisibility={i: self.map.covisibility[i] for i in sorted(self._edges)},
             correction=correction,
+            scales=dict(self._scales),
         )
-        self._new = []
+        self._new, self._scales = [], {}
         for changed in (self._keyframes, self._landmarks, self._removed, self._edges):
             changed.clear()
         return update
