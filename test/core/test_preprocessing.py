@@ -18,6 +18,7 @@ from thegra_core.config import PreprocessingConfig
 from thegra_core.errors import ConfigError
 from thegra_core.preprocessing import chambolle, filters, repair, windows
 from thegra_core.preprocessing.chain import FILTERS, LIMITS, Chain
+from thegra_core.preprocessing.noise import noise_sigma
 from thegra_core.preprocessing.stability import SteadyWindow
 from thegra_core.sources.open import open_recording
 
@@ -109,6 +110,22 @@ def test_chambolle_smooths_more_with_weight_and_keeps_the_mean(weight):
     assert smooth.dtype == np.float32
     assert smooth.mean() == pytest.approx(image.mean(), abs=0.05)
     assert np.abs(np.diff(smooth)).sum() < np.abs(np.diff(image.astype(float))).sum()
+
+
+@pytest.mark.parametrize("noise", [0.5, 3.0, 20.0])
+def test_noise_is_measured(noise):
+    y, x = np.mgrid[:256, :320]
+    image = 3000 + 200 * np.sin(x / 40) + 0.5 * y + 300.0 * (x // 64 % 2) + np.random.default_rng(1).normal(0, noise, x.shape)
+    assert noise_sigma(image.astype(np.float32)) == pytest.approx(noise, rel=0.1)
+    assert noise_sigma(np.rint(image).astype(np.uint16)) == pytest.approx(np.hypot(noise, 0.29), rel=0.1)  # whole counts add theirs
+    assert noise_sigma(np.zeros((40, 2), np.uint16)) == 0
+
+
+def test_chambolle_by_noise_does_not_depend_on_the_gain():
+    image = thermal(2).astype(np.float32)
+    plain = filters.chambolle_tv(image, 1.0, "noise")
+    np.testing.assert_allclose(filters.chambolle_tv(7 * image, 1.0, "noise"), 7 * plain, rtol=1e-4)
+    np.testing.assert_allclose(plain, filters.chambolle_tv(image, noise_sigma(image)), rtol=1e-6)
 
 
 def test_he_cdf_8_bit_is_opencvs_and_16_bit_uses_the_whole_range():
@@ -298,7 +315,7 @@ def test_chain_is_the_papers():
     image = thermal(height=512, width=640)
     denoised = denoise_tv_chambolle(image.astype(np.float64), weight=4.0)
     expected = cv2.medianBlur(he_clip_as_published(np.rint(denoised).astype(np.uint16), 10000, fold=False), 3)
-    out = Chain(PreprocessingConfig())(image, 0)
+    out = Chain(cfg.load_config("paper").preprocessing)(image, 0)
     assert out.dtype == np.uint8
     difference = np.abs(out.astype(int) - expected)
     assert np.mean(difference <= 1) > 0.99  # the reference rounds to whole counts before its map, one count is about one grey level here
@@ -385,7 +402,7 @@ def test_a_stove_does_not_crush_the_rest(name):
 
 
 def test_without_a_steady_window_frames_do_not_know_each_other():
-    chain = Chain(PreprocessingConfig())
+    chain = Chain(cfg.load_config("paper").preprocessing)
     first = chain(thermal(0), 0)
     chain(thermal(1) + 3000, 1)
     np.testing.assert_array_equal(chain(thermal(0), 2), first)
@@ -397,6 +414,6 @@ def test_real_frames(shared_data):
         image = next(iter(open_recording(shared_data / name).frames())).image
         denoised = denoise_tv_chambolle(image.astype(np.float32), weight=4.0).astype(np.float32)
         expected = cv2.medianBlur(windows.he_clip(denoised), 3)
-        out = Chain(PreprocessingConfig())(image, 0)
+        out = Chain(cfg.load_config("paper").preprocessing)(image, 0)
         assert np.mean(np.abs(out.astype(int) - expected) <= 1) >= 0.999, name
         assert out.std() > 35

@@ -13,21 +13,28 @@ from numpy.typing import NDArray
 
 from thegra_core.messages import ImageArray
 from thegra_core.preprocessing import chambolle
+from thegra_core.preprocessing.noise import noise_sigma
 
 _LEVELS_16 = 65536
 
 
-def chambolle_tv(image: ImageArray, weight: float = 4.0, eps: float = 2e-4, max_iterations: int = 200) -> NDArray[np.float32]:
+def chambolle_tv(
+    image: ImageArray, weight: float = 4.0, unit: str = "grey_levels", eps: float = 2e-4, max_iterations: int = 200
+) -> NDArray[np.float32]:
     """Total-variation denoising (Chambolle 2004), to float32; equals scikit-image's on the same values as floats.
 
     Args:
         image: Any of the three types; values are taken as they are.
-        weight: Grey levels of `image`.
+        weight: In `unit`s.
+        unit: "grey_levels" of `image`, or "noise": standard deviations of its noise. The same weight in grey levels leaves the noise of one sensor
+            and takes the scene of another.
         eps: Stops when the cost changes by less than this share of its first value.
         max_iterations: At the most.
     """
     values = image.astype(np.float32)
-    if values.min() == values.max():
+    if unit == "noise":
+        weight *= noise_sigma(image)
+    if weight <= 0 or values.min() == values.max():
         return values
     return chambolle.denoise(values, weight, eps, max_iterations)
 

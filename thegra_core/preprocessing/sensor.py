@@ -9,15 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.messages import ImageArray
+from thegra_core.preprocessing.noise import EVERY, FINE_GAIN, clipped, noise_of, sampled_rows, second_difference
 
 FloatImage = NDArray[np.float32]
 
-_ROWS = 24
-"""Rows that are looked at: enough pixels for a weak pattern, few enough for half a millisecond."""
-_EVERY = 4
-"""Of those rows' pixels, which take part in medians."""
-_FINE_GAIN = 1.5**0.5
-"""Standard deviation of the second difference of white noise over that of the noise."""
 _MEMORY = 32
 _KNOWN_AFTER = 8
 """Frames before a usual value is known."""
@@ -52,13 +47,10 @@ class SensorLook:
     @classmethod
     def at(cls, image: ImageArray) -> SensorLook:
         """The look at an image (H, W) of any type."""
-        step = max(image.shape[0] // _ROWS, 1)
-        values = image[step // 2 :: step].astype(np.float32)
-        fine = _second_difference(values)
-        scale = float(np.median(np.abs(fine[:, ::_EVERY])))
-        limit = np.float32(3 * max(scale, 1e-6))
-        low, high = np.percentile(values[:, ::_EVERY], [5, 95])
-        return cls(values, np.clip(fine, -limit, limit), scale / (0.6745 * _FINE_GAIN), float(high - low), image.dtype == np.uint8)
+        values = sampled_rows(image)
+        fine = clipped(second_difference(values))
+        low, high = np.percentile(values[:, ::EVERY], [5, 95])
+        return cls(values, fine, noise_of(fine), float(high - low), image.dtype == np.uint8)
 
 
 class SensorWatch:
@@ -104,7 +96,7 @@ class SensorWatch:
 
     def _level_change(self, look: SensorLook, last: SensorLook) -> str:
         """Whether all pixels jumped by the same amount."""
-        difference = (look.values - last.values)[:, ::_EVERY]
+        difference = (look.values - last.values)[:, ::EVERY]
         middle = float(np.median(difference))
         spread = max(1.4826 * float(np.median(np.abs(difference - middle))), last.noise)
         step = abs(float(np.clip(difference, middle - 2 * spread, middle + 2 * spread).mean()))
@@ -132,14 +124,9 @@ class SensorWatch:
         return ""
 
 
-def _second_difference(values: FloatImage) -> FloatImage:
-    """Each pixel less the mean of its neighbours in the row, (R, W - 2)."""
-    return values[:, 1:-1] - np.float32(0.5) * (values[:, :-2] + values[:, 2:])
-
-
 def _moving(look: SensorLook, last: SensorLook) -> bool:
     """Whether the difference of two images has more than noise in it, which is the same at all scales."""
     difference = look.values - last.values
-    noise = float(np.mean(np.abs(_second_difference(difference)[:, ::_EVERY]))) / _FINE_GAIN
-    coarse = difference[:, ::_EVERY]
+    noise = float(np.mean(np.abs(second_difference(difference)[:, ::EVERY]))) / FINE_GAIN
+    coarse = difference[:, ::EVERY]
     return float(np.mean(np.abs(coarse - coarse.mean()))) > _MOVING * noise

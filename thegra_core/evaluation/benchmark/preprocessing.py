@@ -46,7 +46,7 @@ def benchmark(frames: Sequence[ImageArray], repeats: int = 5, progress: Callable
             images = [_to_8_bit(f) for f in frames] if name in ON_8_BIT else list(frames)
             filters[name] = _time(functools.partial(FILTERS[name], **parameters), REFERENCES.get(name), images, repeats)
         say("chain")
-        chain = Chain(cfg.PreprocessingConfig())
+        chain = Chain(cfg.load_config("paper").preprocessing)
         timing = _time(lambda image: chain(image, 0), reference_chain, list(frames), repeats)
         within = float(np.mean([np.mean(np.abs(chain(f, 0).astype(int) - reference_chain(f)) <= 1) for f in frames]))
     finally:

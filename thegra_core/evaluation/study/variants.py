@@ -43,6 +43,7 @@ CHAINS: dict[str, PreprocessingConfig] = {
     "band-pass + HE + median": _chain(BandPass(), HistogramClip(), Median()),
     "bilateral + HE + median": _chain(Bilateral(), HistogramClip(), Median()),
     "Chambolle + HE + median": _chain(ChambolleTv(), HistogramClip(), Median()),
+    "Chambolle by noise + HE + median": _chain(ChambolleTv(weight=1.0, unit="noise"), HistogramClip(), Median()),
     "Chambolle + equalisation + median": _chain(ChambolleTv(), HistogramCdf(), Median()),
     "destripe + Chambolle + HE + median": _chain(Destripe(), ChambolleTv(), HistogramClip(), Median()),
     "SVD + Chambolle + HE + median": _chain(SvdDestripe(), ChambolleTv(), HistogramClip(), Median()),
