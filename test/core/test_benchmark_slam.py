@@ -55,7 +55,7 @@ def run_folder(folder: Path, trajectory: str, **changed: object) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     metrics = {
         "frames_total": 10, "tracked_pct": 12.5, "maps": 1, "losses": 0, "relocalizations": 0, "keyframes": 3, "landmarks": 99, "finish_s": 0.1,
-        "cached_pct": None, "peak_rss_mb": 300.0, "ms_per_frame": {"p50": 250.0, "p95": 1500.0, "p99": 2000.0},
+        "loops": 0, "shutter_closures": [], "cached_pct": None, "peak_rss_mb": 300.0, "ms_per_frame": {"p50": 250.0, "p95": 1500.0, "p99": 2000.0},
     }  # fmt: skip
     (folder / "metrics.json").write_text(json.dumps(metrics | changed))
     (folder / "trajectory.txt").write_text(trajectory)

@@ -73,6 +73,27 @@ def test_it_tracks(shared_data: Path, tmp_path: Path, profile: str, name: str, t
 
 @pytest.mark.slow
 @pytest.mark.timeout(PATIENCE_S)
+def test_a_closed_shutter_may_leave_a_gap_instead_of_frozen_frames(shared_data: Path, tmp_path: Path) -> None:
+    whole, cut = shared_data / "sim_room_shutter", tmp_path / "cut"
+    if not whole.is_dir():
+        pytest.skip(f"no recording {whole}")
+    cut.mkdir()
+    for name in ("images", "camera.yaml", "groundtruth.txt", "shutter.txt"):
+        (cut / name).symlink_to(whole / name)
+    closures = [tuple(map(float, line.split())) for line in (whole / "shutter.txt").read_text().splitlines() if line.strip()]
+    lines = (whole / "images.txt").read_text().splitlines(keepends=True)
+    kept = [line for line in lines if line.startswith("#") or not any(begin <= float(line.split()[0]) < end for begin, end in closures)]
+    assert len(kept) < len(lines)
+    (cut / "images.txt").write_text("".join(kept))
+    reached = figures(cut, tmp_path / "out")
+    assert reached["maps"] == 1
+    assert reached["tracked_pct"] >= 97
+    assert reached["ate_rmse"] <= 0.06
+    assert len(reached["shutter_closures"]) == len(closures)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(PATIENCE_S)
 def test_a_plane_from_above_is_tracked_or_left_alone(shared_data: Path, tmp_path: Path) -> None:
     reached = figures(shared_data / "orchard_m2ea_drone", tmp_path, max_frames=15)
     if reached["maps"] > 0:

@@ -32,7 +32,7 @@ from thegra_core.version import VERSION
 _RAN = (0, 1)
 """Exit codes of `thegra run` that come with results: done, nothing tracked."""
 _ERROR_CHARACTERS = 2000
-_FROM_METRICS = ("frames_total", "maps", "losses", "relocalizations", "keyframes", "landmarks", "finish_s", "cached_pct", "peak_rss_mb")
+_FROM_METRICS = ("frames_total", "maps", "losses", "relocalizations", "loops", "shutter_closures", "keyframes", "landmarks", "finish_s", "cached_pct", "peak_rss_mb")
 _STILL = 1e-6
 
 
