@@ -37,7 +37,7 @@ def play(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
     def go(run: Run, *options: str, recording: FakeRecording | None = None, system: FakeSystem | None = None) -> tuple:
         source = recording or FakeRecording(tmp_path, count=len(run.frames))
-        monkeypatch.setattr(run_module, "open_recording", lambda path, topic: source)
+        monkeypatch.setattr(run_module, "open_recording", lambda path, topic, shutter_topic: source)
         monkeypatch.setattr(run_module, "make_system", lambda camera, config: system or FakeSystem(run))
         out = tmp_path / "out"
         return invoke("run", tmp_path, "--out", out, *options), out
