@@ -54,8 +54,8 @@ def figures(recording: Path, out: Path, max_frames: int | None = None, profile: 
     ("profile", "name", "tracked_pct", "ate_rmse"),
     [
         ("quality", "kitchen_rgb_7scenes", 95, 0.03),
-        ("quality", "sim_corridor_loop", 95, 0.25),
-        ("quality", "sim_room_shutter", 97, 0.06),
+        ("quality", "sim_corridor_loop", 97, 0.12),
+        ("quality", "sim_room_shutter", 97, 0.05),
         ("quality", "forest_f6_line1", 93, 0.25),
         ("quality", "forest_f0", 90, 0.3),
         ("paper", "kitchen_rgb_7scenes", 95, 0.045),
