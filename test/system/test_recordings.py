@@ -37,8 +37,9 @@ def figures(recording: Path, out: Path, max_frames: int | None = None, profile: 
     """Figures of one run with seed 0."""
     if not recording.is_dir():
         pytest.skip(f"no recording {recording}")
-    if missing_weights(profile):
-        pytest.skip(missing_weights(profile))
+    missing = missing_weights(profile)
+    if missing:
+        pytest.skip(missing)
     limits = {recording.name: max_frames} if max_frames is not None else {}
     plan = Plan((recording,), out, (profile,), max_frames=limits)
     (run,) = planned_runs(plan)

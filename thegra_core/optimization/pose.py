@@ -13,6 +13,8 @@ from thegra_core.geometry import poses, triangulation
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 ROUNDS, STEPS = 4, 10
+RANSAC_THRESHOLD_PX = 4.0
+"""Inlier threshold of a first pose: wide, since the map's points carry their own error; refinement gates at the chi-square limit."""
 GROSS = 16.0
 """Times the gate, or the median if that is more: squared errors at the start that are no error of the start."""
 

@@ -22,7 +22,7 @@ class PlaceIndex:
         self._seed = seed
         self._waiting: dict[int, Features] = {}
         self._vocabulary: FloatArray | None = None
-        self._ids: list[int] = []
+        self._rows: dict[int, int] = {}
         self._vectors = np.empty((0, 0), np.float32)
 
     def add(self, keyframe_id: int, features: Features) -> None:
@@ -40,10 +40,10 @@ class PlaceIndex:
 
     def similarity(self, keyframe_id: int) -> dict[int, float]:
         """Cosine of every keyframe's vector with that of one of them; empty while there is no vocabulary."""
-        if keyframe_id not in self._ids:
+        if keyframe_id not in self._rows:
             return {}
-        known = self._vectors[: len(self._ids)]
-        return dict(zip(self._ids, (known @ known[self._ids.index(keyframe_id)]).tolist(), strict=True))
+        known = self._vectors[: len(self._rows)]
+        return dict(zip(self._rows, (known @ known[self._rows[keyframe_id]]).tolist(), strict=True))
 
     def candidates(self, keyframe_id: int, connected: Sequence[int]) -> list[int]:
         """Keyframes that look nearly as much like this one as those do that see the same, the most similar first.
@@ -61,9 +61,11 @@ class PlaceIndex:
     def _append(self, keyframe_id: int, features: Features) -> None:
         assert self._vocabulary is not None
         vector = describe(features, self._vocabulary)
-        if len(self._ids) == len(self._vectors):
-            grown = np.zeros((max(64, 2 * len(self._vectors)), len(vector)), np.float32)
-            grown[: len(self._ids)] = self._vectors.reshape(len(self._ids), -1) if self._ids else 0.0
+        count = len(self._rows)
+        if count == len(self._vectors):
+            grown = np.zeros((max(64, 2 * count), len(vector)), np.float32)
+            if count:
+                grown[:count] = self._vectors
             self._vectors = grown
-        self._vectors[len(self._ids)] = vector
-        self._ids.append(keyframe_id)
+        self._vectors[count] = vector
+        self._rows[keyframe_id] = count

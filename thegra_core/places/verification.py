@@ -12,13 +12,13 @@ from thegra_core.config import ThegraConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry import poses
 from thegra_core.geometry.similarity import Similarity
+from thegra_core.map.inheritance import inherited_landmarks
 from thegra_core.map.map import Map, MapKeyframe
 from thegra_core.messages import Matches
-from thegra_core.optimization.pose import estimate_pose, refine_pose
+from thegra_core.optimization.pose import RANSAC_THRESHOLD_PX, estimate_pose, refine_pose
 from thegra_core.optimization.weighting import observation_weights
 
 IntArray = NDArray[np.int64]
-RANSAC_THRESHOLD_PX = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,8 @@ def sight(current: Map, keyframe_id: int, group: list[int], matcher: Matcher, co
         return f"{len(first)} matches"
     others = matcher.match_many(keyframe.features, [current.keyframes[i].features for i in group[1:]])
     matched = dict(zip(group, [first, *others], strict=True))
-    keypoints, landmarks = _old_landmarks(current, keyframe, matched)
+    defined = np.asarray(np.isfinite(keyframe.normalized).all(axis=1))
+    keypoints, landmarks = inherited_landmarks(current, matched, defined)
     if len(keypoints) < settings.min_inliers:
         return f"{len(keypoints)} matches with landmarks"
     points = current.landmarks.points_world[current.landmarks.rows(landmarks)]
@@ -75,23 +76,6 @@ def agree(current: Map, one: Sighting, other: Sighting, config: ThegraConfig) ->
         and float(np.linalg.norm(difference.rigid[:3, 3])) <= settings.max_translation_ratio * depth
         and abs(np.log(difference.scale)) <= settings.max_scale_spread
     )
-
-
-def _old_landmarks(current: Map, keyframe: MapKeyframe, matched: Mapping[int, Matches]) -> tuple[IntArray, IntArray]:
-    """Keypoints (M,) and the old landmarks (M,) that they match, one to one, the most confident match first."""
-    keypoints, ids, confidence = [], [], []
-    defined = np.asarray(np.isfinite(keyframe.normalized).all(axis=1))
-    for other, matches in matched.items():
-        inherited = current.keyframes[other].landmark_ids[matches.indices[:, 1]]
-        use = (current.landmarks.rows(inherited) >= 0) & defined[matches.indices[:, 0]]
-        keypoints.append(matches.indices[use, 0].astype(np.int64))
-        ids.append(inherited[use])
-        confidence.append(matches.confidence[use])
-    all_keypoints, all_ids = np.concatenate(keypoints), np.concatenate(ids)
-    order = np.argsort(-np.concatenate(confidence), kind="stable")
-    for key in (all_keypoints, all_ids):
-        order = order[np.sort(np.unique(key[order], return_index=True)[1])]
-    return all_keypoints[order], all_ids[order]
 
 
 def _scale(current: Map, keyframe: MapKeyframe, keypoints: IntArray, old_depth: NDArray[np.float64], config: ThegraConfig) -> float | str:

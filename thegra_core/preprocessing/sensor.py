@@ -80,7 +80,8 @@ class SensorWatch:
         last = self._last
         change = ""
         if last is not None and last.values.shape == look.values.shape:
-            change = self._level_change(look, last) or self._pattern_change(look, last)
+            difference = look.values - last.values
+            change = self._level_change(look, last, difference[:, ::EVERY]) or self._pattern_change(look, difference)
         if change or (last is not None and last.values.shape != look.values.shape):
             self.forget()
         self._last = look
@@ -94,9 +95,8 @@ class SensorWatch:
         for kept in (self._strengths, self._steps, self._spreads):
             kept.clear()
 
-    def _level_change(self, look: SensorLook, last: SensorLook) -> str:
+    def _level_change(self, look: SensorLook, last: SensorLook, difference: FloatImage) -> str:
         """Whether all pixels jumped by the same amount."""
-        difference = (look.values - last.values)[:, ::EVERY]
         middle = float(np.median(difference))
         spread = max(1.4826 * float(np.median(np.abs(difference - middle))), last.noise)
         step = abs(float(np.clip(difference, middle - 2 * spread, middle + 2 * spread).mean()))
@@ -106,7 +106,7 @@ class SensorWatch:
             return ""
         return f"the level of the whole image jumped by {step:.3g}"
 
-    def _pattern_change(self, look: SensorLook, last: SensorLook) -> str:
+    def _pattern_change(self, look: SensorLook, difference: FloatImage) -> str:
         strength = 0.0
         if self._pattern is not None:
             size = max(float(np.linalg.norm(self._pattern)), 1e-12)
@@ -115,7 +115,7 @@ class SensorWatch:
             usual = float(np.median(self._strengths)) if len(self._strengths) == _KNOWN_AFTER else 0.0
             if usual > _KNOWN_PATTERN * error and strength < _SAME * usual and strength + 3 * error < _SURE * usual:
                 return f"the fixed pattern changed: {100 * max(strength, 0.0) / usual:.0f} % of it are left"
-        if _moving(look, last):
+        if _moving(difference):
             self._learned += 1
             share = np.float32(1.0 / min(self._learned, _PATTERN_FRAMES))
             self._pattern = look.fine if self._pattern is None else self._pattern + share * (look.fine - self._pattern)
@@ -124,9 +124,8 @@ class SensorWatch:
         return ""
 
 
-def _moving(look: SensorLook, last: SensorLook) -> bool:
+def _moving(difference: FloatImage) -> bool:
     """Whether the difference of two images has more than noise in it, which is the same at all scales."""
-    difference = look.values - last.values
     noise = float(np.mean(np.abs(second_difference(difference)[:, ::EVERY]))) / FINE_GAIN
     coarse = difference[:, ::EVERY]
     return float(np.mean(np.abs(coarse - coarse.mean()))) > _MOVING * noise

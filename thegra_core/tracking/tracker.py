@@ -11,19 +11,17 @@ from numpy.typing import NDArray
 from thegra_core.config import ThegraConfig, TrackingConfig
 from thegra_core.geometry import poses
 from thegra_core.geometry.camera import CameraModel
+from thegra_core.map.inheritance import inherited_landmarks
 from thegra_core.map.map import Map
 from thegra_core.map.projection import VisibleLandmarks, match_by_projection, visible_landmarks
 from thegra_core.messages import NO_LANDMARK, Features, Matches
 from thegra_core.optimization.hybrid import LandmarkView, SharedView, estimate_hybrid_pose, refine_hybrid_pose
-from thegra_core.optimization.pose import PoseEstimate, estimate_pose, refine_pose
+from thegra_core.optimization.pose import RANSAC_THRESHOLD_PX, PoseEstimate, estimate_pose, refine_pose
 from thegra_core.optimization.weighting import observation_weights
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-
-RANSAC_THRESHOLD_PX = 4.0
-"""Inlier threshold of the first pose: wide, since the map's points carry their own error; refinement gates at the chi-square limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,26 +167,6 @@ def _pose_from_matches(
         return None, f"{int(estimate.inliers.sum())} inliers of {len(ids)} matches to {where}"
     landmark_ids[keypoints[estimate.inliers]] = ids[estimate.inliers]
     return estimate.camera_from_world, ""
-
-
-def inherited_landmarks(current: Map, matched: Mapping[int, Matches], defined: BoolArray) -> tuple[IntArray, IntArray]:
-    """Keypoints (M,) of a frame and the landmarks (M,) that they inherit by its matches to keyframes, one to one, the most confident match first.
-
-    defined (N,) bool: the frame's keypoints that may be used.
-    """
-    keypoints, ids, confidence = [], [], []
-    for keyframe_id, matches in matched.items():
-        inherited = current.keyframes[keyframe_id].landmark_ids[matches.indices[:, 1]]
-        use = (current.landmarks.rows(inherited) >= 0) & defined[matches.indices[:, 0]]
-        keypoints.append(matches.indices[use, 0].astype(np.int64))
-        ids.append(inherited[use])
-        confidence.append(matches.confidence[use])
-    all_keypoints, all_ids = np.concatenate(keypoints), np.concatenate(ids)
-    order = np.argsort(-np.concatenate(confidence), kind="stable")
-    for key in (all_keypoints, all_ids):
-        order = order[np.sort(np.unique(key[order], return_index=True)[1])]
-    order = order[np.argsort(all_keypoints[order], kind="stable")]
-    return all_keypoints[order], all_ids[order]
 
 
 def _refine_with_local_map(
