@@ -22,6 +22,7 @@ REQUIRES = [
     "scipy>=1.11",
     "rosbags>=0.11",
     "mcap>=1.2",
+    "numba>=0.60",
     "poselib>=2.0.4",
     "pydantic>=2.7",
     "PyYAML>=6.0",

@@ -259,7 +259,7 @@ class MappingConfig(Section):
     """Growing and cleaning the map."""
 
     covisibility_threshold: int = Field(15, ge=1, description="shared landmarks that make an edge; ORB-SLAM3: 15")
-    neighbours: int = Field(3, ge=1, le=30, description="covisible keyframes that a new keyframe is matched to; ORB-SLAM3: 30, with learned matching each costs a network run")
+    neighbours: int = Field(3, ge=1, le=30, description="covisible keyframes that a new keyframe is matched to, its reference among them; ORB-SLAM3: 30, with learned matching each but the reference costs a network run")
     chained_keyframes: int = Field(10, ge=0, description="keyframes that a new one is matched to through a common neighbour, without the network")
     good_baseline_ratio: float = Field(0.1, ge=0, description="distance to a neighbour over median depth from which its baseline counts in full when neighbours are chosen")
     epipolar_px: float = Field(2.0, gt=0, description="px to the epipolar line; chi-square 3.84 at 1 px is 1.96 px")

@@ -12,6 +12,7 @@ from thegra_core.cli import exit_codes
 from thegra_core.cli.benchmark import app as benchmark_app
 from thegra_core.cli.weights import app as weights_app
 from thegra_core.errors import ThegraError
+from thegra_core.process import keep_freed_memory
 from thegra_core.version import VERSION
 
 
@@ -42,6 +43,7 @@ app = typer.Typer(
 
 def main() -> None:
     """Entry point of the console script."""
+    keep_freed_memory()
     app()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import shlex
 import signal
 import sys
@@ -26,6 +25,7 @@ from thegra_core.outputs.metrics import Timing
 from thegra_core.outputs.trajectory import NS_PER_S, read_tum
 from thegra_core.outputs.viewer import Viewer, make_viewer
 from thegra_core.outputs.write import RecordingFacts, write_run
+from thegra_core.process import set_threads
 from thegra_core.sources.open import camera_for, open_recording
 from thegra_core.sources.recording import Recording
 from thegra_core.version import VERSION
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from thegra_core.features.protocols import Extractor, Matcher
 
 _log = logging.getLogger(__name__)
-MOST_THREADS = 4
-"""Of the networks by default; a keyframe's 1024 points do not fill more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,22 +127,10 @@ def run_recording(options: RunOptions) -> int:
 
 def make_system(camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None) -> System:
     """The SLAM system; imported here because the networks take seconds to load."""
-    _set_threads(config.threads)
+    set_threads(config.threads)
     from thegra_core.slam import Slam
 
     return Slam(camera, config, extractor, matcher)
-
-
-def _set_threads(count: int) -> None:
-    """Tell OpenMP, which reads it when torch is imported (a cache may make that unnecessary), how many threads to use, and to wait briefly, then sleep.
-
-    Threads that wait for each other by spinning are fastest on idle cores and far slower on busy ones, threads that sleep at once the other way round.
-    A brief wait is near the better of the two in both cases (measured).
-    """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    os.environ.setdefault("OMP_NUM_THREADS", str(count or min(cores, MOST_THREADS)))
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 
 def _cached_front_end(config: ThegraConfig, folder: Path | None) -> tuple[()] | tuple[CachedExtractor, CachedMatcher]:

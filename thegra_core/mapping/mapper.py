@@ -122,7 +122,7 @@ class Mapper:
         known: dict[int, Matches] = {}
         if keyframe.reference_matches is not None and keyframe.reference_id in editor.map.keyframes:
             known[keyframe.reference_id] = keyframe.reference_matches
-        open_ids = [i for i in neighbours if i not in known]
+        open_ids = [i for i in neighbours if i not in known][: self._config.mapping.neighbours - len(known)]
         matched = self._matcher.match_many(features, [editor.map.keyframes[i].features for i in open_ids])
         known.update(zip(open_ids, matched, strict=True))
         before = editor.next_landmark

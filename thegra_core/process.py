@@ -1,0 +1,43 @@
+"""How this process uses the machine: threads and memory. Called once, where a process starts; nothing here changes a result."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+
+MOST_THREADS = 4
+"""Of the networks by default; a keyframe's 1024 points do not fill more."""
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
+_KEPT_BYTES = 512 << 20
+_LARGEST_BYTES = 256 << 20
+
+
+def set_threads(count: int) -> None:
+    """Tell OpenMP, which reads it when torch is imported (a cache may make that unnecessary), how many threads to use, and to wait briefly, then sleep.
+
+    Threads that wait for each other by spinning are fastest on idle cores and far slower on busy ones, threads that sleep at once the other way round.
+    A brief wait is near the better of the two in both cases (measured).
+
+    Args:
+        count: 0: one a core, `MOST_THREADS` at most. `OMP_NUM_THREADS` wins over it.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    os.environ.setdefault("OMP_NUM_THREADS", str(count or min(cores, MOST_THREADS)))
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+
+
+def keep_freed_memory() -> None:
+    """Let malloc reuse the memory of images and network layers instead of asking the kernel for it, page by page, every time.
+
+    Total-variation denoising takes half the time so, and networks 0.8 of it (measured). Only glibc has the two settings; elsewhere this does nothing.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError):
+        return
+    mallopt(_M_MMAP_THRESHOLD, _LARGEST_BYTES)
+    mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
