@@ -7,11 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
+from thegra_core.errors import InputError
 from thegra_core.features.protocols import Extractor, Matcher
 from thegra_core.features.registry import make_extractor, make_matcher
 from thegra_core.geometry.camera import CameraModel
@@ -73,6 +75,7 @@ class Slam:
         self._snapshots = SnapshotKeeper()
         self._view: Callable[[], Snapshot] | None = None
         self._stage_ms: dict[str, float] = {}
+        self._first_keyframe_id = 0
 
     def process(self, frame: Frame) -> TrackingResult:
         """One frame through all stages; never raises for what an image holds. Bad frames are counted and change nothing."""
@@ -100,6 +103,35 @@ class Slam:
         self._record(frame.index, result, output.provisional, bad=bool(trouble))
         return result
 
+    @property
+    def localization_only(self) -> bool:
+        """Whether the map stays as it is: no keyframe joins it, and no new map is begun."""
+        return self._tracking.localization_only
+
+    @localization_only.setter
+    def localization_only(self, only: bool) -> None:
+        self._tracking.localization_only = only
+
+    def load_map(self, path: Path) -> None:
+        """Begin in a kept map instead of an empty one: the frames to come are sought in all of it. Call it before the first frame.
+
+        Raises:
+            InputError: If the file is not there, not whole, or of another version, camera or extractor.
+        """
+        update = self._mapper.load(path)
+        self._tracking.resume(update)
+        self._first_keyframe_id = 1 + max(m.id for m in update.new_keyframes)
+
+    def save_map(self, path: Path) -> None:
+        """Write the map with most keyframes to one file, in whatever state tracking is.
+
+        Raises:
+            InputError: If there is no map yet, or the file cannot be written.
+        """
+        if not self._mapper.map_ids:
+            raise InputError(f"there is no map yet that could be written to {path}")
+        self._mapper.save(max(self._mapper.map_ids, key=lambda i: (len(self._mapper.map(i).keyframes), -i)), path)
+
     def snapshot(self) -> Snapshot | None:
         """Image, keypoints and tracks of the last frame; None if it was bad or the shutter was closed."""
         return self._view() if self._view is not None else None
@@ -118,7 +150,7 @@ class Slam:
         if unproven is not None:
             self._drop(unproven)
         say("full bundle adjustment")
-        for map_id in self._mapper.map_ids:
+        for map_id in self._mapper.map_ids if not self.localization_only else ():
             update = self._mapper.finish(map_id)
             if map_id == self._tracking.map_id:
                 self._tracking.apply(update)
@@ -131,7 +163,7 @@ class Slam:
                     placed, map_id=found.map_id, reference_id=found.reference_id, reference_from_camera=found.reference_from_camera, afterwards=True
                 )
         maps = {map_id: self._mapper.map(map_id) for map_id in self._mapper.map_ids}
-        by_stamp = {(map_id, k.stamp_ns): k.id for map_id, m in maps.items() for k in m.keyframes.values()}
+        by_stamp = {(map_id, k.stamp_ns): k.id for map_id, m in maps.items() for k in m.keyframes.values() if k.id >= self._first_keyframe_id}
         records = tuple(self._final(placed, maps, by_stamp) for placed in self._frames)
         counts = Counter(r.map_id for r in records if r.world_from_camera is not None)
         return Run(

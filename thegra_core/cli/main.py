@@ -76,6 +76,9 @@ def run(
     start: Annotated[float, typer.Option(metavar="S", min=0.0, help="Seconds of the recording to skip.")] = 0.0,
     duration: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="Seconds of the recording to process.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of every random choice. Default: the configuration's, 0.")] = None,
+    map_: Annotated[Path | None, typer.Option("--map", metavar="FILE", help="Begin in the map of this file and go on in it.")] = None,
+    localization_only: Annotated[bool, typer.Option("--localization-only", help="With --map: find the camera in the map and leave the map as it is.")] = False,
+    save_map: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the map to this file at the end, for --map.")] = None,
     viewer: Annotated[str, typer.Option(help="none, or rerun to watch live.")] = "none",
     cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there: runs that differ only in seed or back end are then much faster.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors and one final line only.")] = False,
@@ -91,6 +94,7 @@ def run(
     options = RunOptions(
         recording=recording, topic=topic, shutter_topic=shutter_topic, camera=camera, profile=profile, config=config, assignments=tuple(set_ or ()), out=out,
         groundtruth=groundtruth, max_frames=max_frames, start_s=start, duration_s=duration, seed=seed, viewer=viewer, quiet=quiet, cache=cache,
+        map=map_, localization_only=localization_only, save_map=save_map,
     )  # fmt: skip
     raise typer.Exit(run_recording(options))
 

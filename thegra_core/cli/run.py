@@ -57,14 +57,21 @@ class RunOptions:
     viewer: str = "none"
     quiet: bool = False
     cache: Path | None = None
+    map: Path | None = None
+    localization_only: bool = False
+    save_map: Path | None = None
 
 
 class System(Protocol):
     """What the command needs of `slam.Slam`."""
 
+    localization_only: bool
+
     def process(self, frame: Frame) -> TrackingResult: ...
     def snapshot(self) -> Snapshot | None: ...
     def current_map(self) -> tuple[FloatArray, FloatArray]: ...
+    def load_map(self, path: Path) -> None: ...
+    def save_map(self, path: Path) -> None: ...
     def finish(self, progress: Callable[[str], None] | None = None) -> Run: ...
 
 
@@ -89,6 +96,7 @@ def run_recording(options: RunOptions) -> int:
         ThegraError: If the input or an option cannot be used; what was processed until then is written.
     """
     started = datetime.now(timezone.utc)
+    _check_map_options(options)
     config = load_config(options.profile, options.config, _overrides(options))
     recording = open_recording(options.recording, options.topic, options.shutter_topic)
     camera = camera_for(recording, options.camera)
@@ -100,6 +108,10 @@ def run_recording(options: RunOptions) -> int:
             _log.info("%s", line)
         front_end = _cached_front_end(config, options.cache)
         system = make_system(camera, config, *front_end)
+        if options.map is not None:
+            progress.stage("reading the map")
+            system.load_map(options.map)
+            system.localization_only = options.localization_only
         done, wall_s = _process(system, _window(recording, options), recording, progress, viewer, interrupted)
         if done.frames == 0 and done.interrupted:
             raise KeyboardInterrupt
@@ -114,6 +126,8 @@ def run_recording(options: RunOptions) -> int:
             notes=tuple(recording.notes), command=shlex.join(["thegra", *sys.argv[1:]]), started_utc=f"{started:%Y-%m-%dT%H:%M:%SZ}",
         )  # fmt: skip
         progress.stage("writing the results")
+        if options.save_map is not None and run.maps:
+            system.save_map(options.save_map)
         written = write_run(run, out, config, facts, groundtruth, timing)
         _log.info("%s", headline(written.metrics))
         done.interrupted = done.interrupted or interrupted()
@@ -221,6 +235,14 @@ def _expected_frames(options: RunOptions, recording: Recording) -> int | None:
 def _no_frames(options: RunOptions, done: _Done) -> str:
     unreadable = "".join(f"\n  {count} x {reason}" for reason, count in done.unreadable.items())
     return f"no frame of {options.recording} lies in the part that --start and --duration choose{unreadable}\nits length is told by: thegra info {options.recording}"
+
+
+def _check_map_options(options: RunOptions) -> None:
+    """Tell before the work what could not be done after it."""
+    if options.localization_only and options.map is None:
+        raise InputError("--localization-only needs a map to find the camera in: add --map FILE; a run writes one with --save-map FILE")
+    if options.save_map is not None and not options.save_map.absolute().parent.is_dir():
+        raise InputError(f"--save-map {options.save_map}: the folder is not there; make it with: mkdir -p {shlex.quote(str(options.save_map.parent))}")
 
 
 def _overrides(options: RunOptions) -> dict[str, Any]:

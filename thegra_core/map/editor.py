@@ -38,6 +38,43 @@ class MapEditor:
         self._edges: set[int] = set()
         self._scales: dict[int, float] = {}
 
+    @classmethod
+    def restored(
+        cls,
+        map_id: int,
+        camera: CameraModel,
+        covisibility_threshold: int,
+        keyframes: Iterable[Keyframe],
+        landmarks: LandmarkArrays,
+        covisibility: Mapping[int, tuple[tuple[int, int], ...]],
+        counts: tuple[IntArray, IntArray, IntArray],
+        next_landmark: int,
+    ) -> MapEditor:
+        """A map that was kept. All of it counts as changed.
+
+        Args:
+            counts: Per landmark (L,) the keyframe that saw it first, in how many frames it was predicted visible, and in how many found.
+            next_landmark: The id that the next new landmark gets.
+        """
+        editor = cls(map_id, camera, covisibility_threshold)
+        ids = landmarks.ids.tolist()
+        editor.observers = {i: {} for i in ids}
+        for message in keyframes:
+            editor.map.keyframes[message.id] = make_keyframe(message, camera)
+            editor._new.append(message)
+            editor._keyframes.add(message.id)
+            for feature in np.flatnonzero(message.landmark_ids != NO_LANDMARK).tolist():
+                editor.observers[int(message.landmark_ids[feature])][message.id] = feature
+        editor.map.landmarks.put(landmarks)
+        first, visible, found = (values.tolist() for values in counts)
+        editor.first_keyframe = dict(zip(ids, first, strict=True))
+        editor.visible, editor.found = Counter(dict(zip(ids, visible, strict=True))), Counter(dict(zip(ids, found, strict=True)))
+        editor._landmarks.update(ids)
+        editor._next_landmark = next_landmark
+        editor.map.covisibility = dict(covisibility)
+        editor._edges.update(covisibility)
+        return editor
+
     # ---- changes --------------------------------------------------------------------------------------------------------------------
 
     def add_keyframe(self, message: Keyframe) -> None:

@@ -12,7 +12,7 @@ from thegra_core.messages import LandmarkArrays
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_COLUMNS = ("ids", "points_world", "normals", "depth_min", "depth_max", "descriptors", "scores")
+COLUMNS = ("ids", "points_world", "normals", "depth_min", "depth_max", "descriptors", "scores")
 _COMPACT_AT = 1024
 
 
@@ -61,7 +61,7 @@ class LandmarkStore:
         rows = self.rows(ids)
         if np.any(rows < 0):
             raise KeyError(f"no landmarks {ids[rows < 0].tolist()}")
-        return LandmarkArrays(**{name: self.column(name)[rows] for name in _COLUMNS})
+        return LandmarkArrays(**{name: self.column(name)[rows] for name in COLUMNS})
 
     def put(self, landmarks: LandmarkArrays) -> None:
         """Overwrite known landmarks, append new ones; new ids must exceed all earlier ones."""
@@ -72,7 +72,7 @@ class LandmarkStore:
         new = np.flatnonzero(~known)
         new = new[np.argsort(landmarks.ids[new])]
         self._reserve(len(new), landmarks)
-        for name in _COLUMNS:
+        for name in COLUMNS:
             values = getattr(landmarks, name)
             self._arrays[name][rows[known]] = values[known]
             self._arrays[name][self._rows : self._rows + len(new)] = values[new]
@@ -87,7 +87,7 @@ class LandmarkStore:
         self._dead += len(rows)
         if self._dead > max(_COMPACT_AT, self._rows // 2):
             keep = np.flatnonzero(self._alive[: self._rows])
-            for name in _COLUMNS:
+            for name in COLUMNS:
                 self._arrays[name] = self._arrays[name][keep].copy()
             self._alive = np.ones(len(keep), dtype=bool)
             self._rows, self._dead = len(keep), 0
@@ -97,7 +97,7 @@ class LandmarkStore:
         if self._rows + extra <= capacity and self._arrays:
             return
         capacity = max(1024, 2 * capacity, self._rows + extra)
-        for name in _COLUMNS:
+        for name in COLUMNS:
             template = getattr(like, name)
             grown = np.zeros((capacity, *template.shape[1:]), dtype=template.dtype)
             if self._rows:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from thegra_core.map.archive import Arrays
+from thegra_core.map.file import offsets
 from thegra_core.messages import Matches
 
 IntArray = NDArray[np.int64]
@@ -22,6 +24,27 @@ class MatchGraph:
         """Keep matches whose queries are the keypoints of `keyframe_id` and whose references are those of `other_id`."""
         self._edges.setdefault(keyframe_id, {})[other_id] = matches
         self._edges.setdefault(other_id, {})[keyframe_id] = reversed_matches(matches)
+
+    def arrays(self) -> Arrays:
+        """All matches for a map file: one row of `edges` (keyframe, other) and one stretch of `indices` and `confidence` a pair."""
+        edges = [(i, other) for i in sorted(self._edges) for other in sorted(self._edges[i]) if i > other]
+        matches = [self._edges[i][other] for i, other in edges]
+        return {
+            "edges": np.array(edges, dtype=np.int64).reshape(-1, 2),
+            "offsets": offsets([len(m) for m in matches]),
+            "indices": np.concatenate([np.empty((0, 2), np.int32), *(m.indices for m in matches)]),
+            "confidence": np.concatenate([np.empty(0, np.float32), *(m.confidence for m in matches)]),
+        }
+
+    @classmethod
+    def restored(cls, arrays: Arrays, stamps_ns: Mapping[int, int]) -> MatchGraph:
+        """The graph of `arrays`; `stamps_ns` by keyframe id."""
+        graph = cls()
+        bounds = arrays["offsets"].tolist()
+        for row, (keyframe_id, other) in enumerate(arrays["edges"].tolist()):
+            mine = slice(bounds[row], bounds[row + 1])
+            graph.add(keyframe_id, other, Matches(stamps_ns[keyframe_id], stamps_ns[other], arrays["indices"][mine], arrays["confidence"][mine]))
+        return graph
 
     def chained(self, keyframe_id: int, most: int) -> list[tuple[int, Matches]]:
         """Keyframes two matches away from a keyframe, with the matches that follow; at most `most`, those with most matches first."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from thegra_core.mapping.adjustment import adjust_all, adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
 from thegra_core.mapping.expansion import expand
 from thegra_core.mapping.loop_closing import LoopCloser
+from thegra_core.mapping.persistence import KeptMap, load_map, save_map
 from thegra_core.messages import InitialMap, Keyframe, MapSummary, MapUpdate, Matches
 
 logger = logging.getLogger(__name__)
@@ -76,6 +78,28 @@ class Mapper:
         editor = self._editors[map_id]
         adjust_all(editor, self._config)
         return editor.take_update()
+
+    def save(self, map_id: int, path: Path) -> None:
+        """Write a map to one file; the map goes on as it is.
+
+        Raises:
+            InputError: If the file cannot be written.
+        """
+        kept = KeptMap(self._editors[map_id], self._graphs[map_id], self._loops[map_id].index, self._trial[map_id])
+        save_map(path, kept, self._config)
+
+    def load(self, path: Path) -> MapUpdate:
+        """Take a map from a file, beside those that are there; returns the whole of it as an update.
+
+        Raises:
+            InputError: If the file is not there, not whole, or of another version, camera or extractor.
+        """
+        map_id = max(self._editors, default=-1) + 1
+        loops = LoopCloser(self._config, self._matcher)
+        kept = load_map(path, map_id, self._camera, self._config, loops.index)
+        self._editors[map_id], self._graphs[map_id], self._trial[map_id], self._loops[map_id] = kept.editor, kept.graph, kept.trial, loops
+        logger.info("%s: %d keyframes and %d landmarks", path, len(kept.editor.map.keyframes), len(kept.editor.map.landmarks))
+        return kept.editor.take_update()
 
     def drop(self, map_id: int) -> None:
         """Forget a map that tracking has given up."""

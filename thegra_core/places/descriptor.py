@@ -35,7 +35,8 @@ def describe(features: Features, vocabulary: FloatArray) -> FloatArray:
     total = np.zeros_like(vocabulary)
     if len(descriptors):
         nearest = _nearest(descriptors, vocabulary)
-        np.add.at(total, nearest, descriptors - vocabulary[nearest])
+        member = (nearest == np.arange(len(vocabulary))[:, None]).astype(np.float32)
+        total = member @ descriptors - member.sum(axis=1, keepdims=True) * vocabulary
     total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
     vector = np.sign(total) * np.sqrt(np.abs(total))
     return np.asarray(vector.ravel() / max(float(np.linalg.norm(vector)), 1e-12), dtype=np.float32)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import LoopConfig
+from thegra_core.map.archive import Arrays
 from thegra_core.messages import Features
 from thegra_core.places.descriptor import describe, learn_vocabulary
 
@@ -44,6 +45,30 @@ class PlaceIndex:
             return {}
         known = self._vectors[: len(self._rows)]
         return dict(zip(self._rows, (known @ known[self._rows[keyframe_id]]).tolist(), strict=True))
+
+    def query(self, features: Features, most: int) -> list[int]:
+        """At most `most` keyframes that look most like an image that is none of them, the most similar first."""
+        if self._vocabulary is None:
+            return []
+        ids = np.array(list(self._rows))
+        similar = self._vectors[: len(ids)] @ describe(features, self._vocabulary)
+        return [int(i) for i in ids[np.argsort(-similar, kind="stable")[:most]]]
+
+    def arrays(self) -> Arrays:
+        """Words and vectors for a map file; nothing before there are words."""
+        if self._vocabulary is None:
+            return {}
+        return {"vocabulary": self._vocabulary, "ids": np.array(list(self._rows), dtype=np.int64), "vectors": self._vectors[: len(self._rows)]}
+
+    def restore(self, arrays: Arrays, features: Mapping[int, Features]) -> None:
+        """Take what `arrays` gave, of the keyframes whose features are given by id."""
+        if not arrays:
+            for keyframe_id, those in features.items():
+                self.add(keyframe_id, those)
+            return
+        self._waiting.clear()
+        self._vocabulary, self._vectors = arrays["vocabulary"], arrays["vectors"]
+        self._rows = {keyframe_id: row for row, keyframe_id in enumerate(arrays["ids"].tolist())}
 
     def candidates(self, keyframe_id: int, connected: Sequence[int]) -> list[int]:
         """Keyframes that look nearly as much like this one as those do that see the same, the most similar first.

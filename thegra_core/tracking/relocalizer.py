@@ -8,6 +8,7 @@ from thegra_core.config import ThegraConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.map.map import Map
 from thegra_core.messages import Features, Matches
+from thegra_core.places.index import PlaceIndex
 from thegra_core.tracking.tracker import Localization, best_reference, localize
 
 
@@ -37,6 +38,18 @@ def last_keyframes(current: Map, reference_id: int, count: int) -> list[int]:
     covisible = current.neighbours(reference_id, count)
     ordered = [i for pair in zip(newest, [*covisible, *newest[len(covisible) :]], strict=False) for i in pair]
     return [i for i in dict.fromkeys(ordered) if i != reference_id][:count]
+
+
+def similar_keyframes(current: Map, places: PlaceIndex, features: Features, reference_id: int, count: int) -> list[int]:
+    """At most `count` ids: the keyframe that looks most like the frame, the best neighbour of it, then the next that look alike; newest while there are no words.
+
+    The reference is left out, which tracking has tried.
+    """
+    alike = places.query(features, count + 1)
+    if not alike:
+        return last_keyframes(current, reference_id, count)
+    ordered = [alike[0], *current.neighbours(alike[0], 1), *alike[1:]]
+    return [i for i in dict.fromkeys(ordered) if i != reference_id and i in current.keyframes][:count]
 
 
 def nearest_in_time(current: Map, stamp_ns: int, count: int) -> list[int]:

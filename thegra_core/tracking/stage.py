@@ -15,10 +15,11 @@ from thegra_core.geometry import poses
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map
 from thegra_core.messages import NO_LANDMARK, Features, InitialMap, Keyframe, MapUpdate, Matches, TrackingResult, TrackingState, VisibilityCounts
+from thegra_core.places.index import PlaceIndex
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
 from thegra_core.tracking.motion import MotionModel
-from thegra_core.tracking.relocalizer import last_keyframes, nearest_in_time, relocalize
+from thegra_core.tracking.relocalizer import last_keyframes, nearest_in_time, relocalize, similar_keyframes
 from thegra_core.tracking.tracker import FrameView, Localization, best_reference, localize
 
 FloatArray = NDArray[np.float64]
@@ -55,14 +56,19 @@ class LateLocalization:
 
 @dataclass(slots=True)
 class _Place:
-    """Where tracking is: a replica of a map, keyframes of it, and what has been seen since the last one."""
+    """Where tracking is: a replica of a map and of its places, keyframes of it, and what has been seen since the last one.
+
+    resumed: the map was made in another run, so that its stamps say nothing about this one.
+    """
 
     map: Map
+    places: PlaceIndex
     reference_id: int
     last_keyframe_id: int
     probation: int
     lost_frames: int = 0
     search_frames: int = 0
+    resumed: bool = False
     motion: MotionModel = field(default_factory=MotionModel)
     visible: list[IntArray] = field(default_factory=list)
     found: list[IntArray] = field(default_factory=list)
@@ -99,6 +105,7 @@ class TrackingStage:
         self._next_keyframe_id = 0
         self._next_map_id = 0
         self._unplaced: deque[Features] = deque(maxlen=config.relocalization.remembered_frames)
+        self.localization_only = False
         self.losses = 0
         self.relocalizations = 0
 
@@ -135,6 +142,15 @@ class TrackingStage:
         )  # fmt: skip
         return TrackingOutput(result)
 
+    def resume(self, update: MapUpdate) -> None:
+        """Take up a map that was kept, before the first frame: the frames to come are sought in all of it."""
+        newest = max(m.id for m in update.new_keyframes)
+        place = _Place(Map(update.map_id, self._camera), self._place_index(), newest, newest, probation=0, lost_frames=1, resumed=True)
+        place.search_frames = self._config.relocalization.search_frames
+        self._place = place
+        self._next_map_id, self._next_keyframe_id = update.map_id + 1, newest + 1
+        self.apply(update)
+
     def reopen(self) -> None:
         """The camera sees again after a time that it did not: until it is found, or `search_frames` have passed, it counts as sought for, not as lost."""
         if self._place is not None and self._place.lost_frames == 0:
@@ -152,6 +168,8 @@ class TrackingStage:
             return
         before = {m.id: m.world_from_camera for m in update.new_keyframes}
         place.map.apply(update)
+        for message in update.new_keyframes:
+            place.places.add(message.id, message.features)
         if before:
             newest = max(before)
             place.reference_id = place.last_keyframe_id = newest
@@ -171,7 +189,7 @@ class TrackingStage:
         for features in self._unplaced:
             if features.stamp_ns in keyframe_stamps:
                 continue
-            candidates = nearest_in_time(current, features.stamp_ns, 2)
+            candidates = self._place.places.query(features, 2) if self._place.resumed else nearest_in_time(current, features.stamp_ns, 2)
             found = relocalize(current, features, candidates, self._matcher, self._config, self._config.relocalization.min_inliers)
             if found is not None:
                 relative = current.keyframes[found[1]].camera_from_world @ found[0].world_from_camera
@@ -190,7 +208,7 @@ class TrackingStage:
 
     def _begin_map(self, features: Features, initial: InitialMap) -> TrackingOutput:
         last = initial.keyframes[-1]
-        place = _Place(Map(initial.map_id, self._camera), last.id, last.id, self._config.initialization.probation_frames)
+        place = _Place(Map(initial.map_id, self._camera), self._place_index(), last.id, last.id, self._config.initialization.probation_frames)
         for keyframe in initial.keyframes[-2:]:
             place.motion.update(keyframe.stamp_ns, keyframe.world_from_camera)
         self._before, self._place = self._place, place
@@ -216,8 +234,9 @@ class TrackingStage:
         place.probation = max(0, place.probation - 1)
         world_from_camera = found.world_from_camera
         place.motion.update(features.stamp_ns, world_from_camera, found.covariance)
-        place.visible.append(found.visible_ids)
-        place.found.append(found.landmark_ids[found.landmark_ids >= 0])
+        if not self.localization_only:
+            place.visible.append(found.visible_ids)
+            place.found.append(found.landmark_ids[found.landmark_ids >= 0])
         matched_to = place.reference_id
         keyframe = self._as_keyframe(place, features, found, matches)
         if keyframe is None:
@@ -243,6 +262,8 @@ class TrackingStage:
 
     def _as_keyframe(self, place: _Place, features: Features, found: Localization, matches: Matches) -> Keyframe | None:
         """The frame as a keyframe message if one is due."""
+        if self.localization_only:
+            return None
         last, reference = place.map.keyframes[place.last_keyframe_id], place.map.keyframes[place.reference_id]
         tracked_ratio = found.inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
         depth = place.map.median_depth(place.reference_id, found.world_from_camera)
@@ -256,14 +277,17 @@ class TrackingStage:
         return keyframe
 
     def _recover(self, place: _Place, features: Features, matches: Matches, reason: str) -> TrackingOutput:
-        """Tracking failed: drop a map on probation; else the last keyframes, then a new map beside the old one."""
+        """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
         if place.probation:
             dropped = self._drop()
             logger.info("map %s did not stand its probation: %s", dropped, reason)
             output = self._start(features, None) if self._place is None else self._stay_lost(self._place, features, reason)
             return replace(output, dropped_map_id=dropped)
         settings = self._config.relocalization
-        candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
+        if place.lost_frames == 0:
+            candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
+        else:
+            candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
         least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
         found = relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
         if found is not None:
@@ -281,7 +305,7 @@ class TrackingStage:
             self.losses += 1
             logger.warning("lost at %.3f s: %s", features.stamp_ns / 1e9, reason)
         place.lost_frames += 1
-        if place.lost_frames >= self._config.relocalization.new_map_after_frames:
+        if place.lost_frames >= self._config.relocalization.new_map_after_frames and not self.localization_only:
             initial = self._initializer.add(features, None, self._next_map_id, self._next_keyframe_id)
             if not isinstance(initial, str):
                 logger.info("map %d continues after %d frames lost", initial.map_id, place.lost_frames)
@@ -289,6 +313,9 @@ class TrackingStage:
             reason = f"{reason}; a new map waits: {initial}"
         self._unplaced.append(features)
         return TrackingOutput(TrackingResult(features.stamp_ns, TrackingState.LOST, keypoints=len(features), map_id=place.map.map_id, reason=reason))
+
+    def _place_index(self) -> PlaceIndex:
+        return PlaceIndex(self._config.loop, self._config.seed)
 
     def _drop(self) -> int:
         """Back to where tracking was before the current map began."""
