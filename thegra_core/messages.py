@@ -173,13 +173,21 @@ class KeyframeState:
 
 
 @dataclass(frozen=True, slots=True)
+class Absorbed:
+    """A map that has become part of another: a point x of its world is scale * R x + t in the other's, with `rigid` (4, 4) holding R and t."""
+
+    map_id: int
+    rigid: FloatArray
+    scale: float
+
+
+@dataclass(frozen=True, slots=True)
 class MapUpdate:
     """Everything that mapping changed since the last update; applying it to a replica makes the replica equal to the map.
 
     `new_keyframes` carry their features; `keyframes` restate pose and landmark ids of each keyframe that changed (the new ones too);
-    `landmarks` restate each landmark that is new or changed; `correction` is the Sim(3) (4x4 with scale in the rotation block)
-    that moved the world under tracking, None where the world stayed; `scales` tells by what factor the surroundings of keyframes grew, where
-    a loop changed their scale.
+    `landmarks` restate each landmark that is new or changed; `absorbed` names a map that this one has taken in, and the update then holds all of the map;
+    `scales` tells by what factor the surroundings of keyframes grew, where a loop changed their scale.
     """
 
     version: int
@@ -190,7 +198,7 @@ class MapUpdate:
     landmarks: LandmarkArrays | None = None
     removed_landmark_ids: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     covisibility: Mapping[int, tuple[tuple[int, int], ...]] = field(default_factory=dict)  # keyframe id -> ((keyframe id, shared points), ...)
-    correction: FloatArray | None = None
+    absorbed: Absorbed | None = None
     scales: Mapping[int, float] = field(default_factory=dict)
 
 

@@ -44,6 +44,13 @@ class _Placed:
     afterwards: bool = False
     bad: bool = False
 
+    def scaled(self, scale: float, map_id: int) -> _Placed:
+        """The same in a map whose unit is smaller by `scale`."""
+        assert self.reference_from_camera is not None
+        relative = self.reference_from_camera.copy()
+        relative[:3, 3] *= scale
+        return replace(self, reference_from_camera=relative, map_id=map_id)
+
     @property
     def may_be_placed(self) -> bool:
         """A good frame that had no pose at its time."""
@@ -173,6 +180,7 @@ class Slam:
             shutter_closures_ns=tuple(self._closures),
             losses=self._tracking.losses,
             loops=self._mapper.loops,
+            merges=self._mapper.merges,
             relocalizations=self._tracking.relocalizations,
             bad_frames=dict(self._bad),
             snapshots=self._snapshots.kept(),
@@ -201,7 +209,7 @@ class Slam:
             elif output.keyframe is not None:
                 update = self._mapper.insert(output.keyframe)
                 self._tracking.apply(update)
-                self._rescale(update)
+                self._follow(update)
         self._view = lambda: _snapshot(frame, image, features, output, reference)
         self._snapshots.offer(frame.index, self._view)
         return output
@@ -239,19 +247,23 @@ class Slam:
         if placed.state is not TrackingState.TRACKING or placed.world_from_camera is None:
             self._frames.append(_Placed(result, index, bad=bad))
             return
-        reference = self._mapper.map(placed.map_id).keyframes[placed.reference_id]
+        map_id = placed.map_id if placed.map_id in self._mapper.map_ids else self._tracking.map_id  # its map may just have become part of another
+        reference = self._mapper.map(map_id).keyframes[placed.reference_id]
         relative = np.eye(4) if placed.is_keyframe else reference.camera_from_world @ placed.world_from_camera
-        self._frames.append(_Placed(result, index, placed.map_id, placed.reference_id, relative, afterwards=provisional is not None))
+        self._frames.append(_Placed(result, index, map_id, placed.reference_id, relative, afterwards=provisional is not None))
 
-    def _rescale(self, update: MapUpdate) -> None:
-        """Frames keep their place beside their keyframe when a loop changes the scale there."""
-        if not update.scales:
+    def _follow(self, update: MapUpdate) -> None:
+        """Frames keep their place beside their keyframe when a loop changes the scale there, or their map becomes part of another."""
+        absorbed = update.absorbed
+        if not update.scales and absorbed is None:
             return
         for row, placed in enumerate(self._frames):
-            if placed.map_id == update.map_id and placed.reference_from_camera is not None:
-                relative = placed.reference_from_camera.copy()
-                relative[:3, 3] *= update.scales.get(placed.reference_id, 1.0)
-                self._frames[row] = replace(placed, reference_from_camera=relative)
+            if placed.reference_from_camera is None:
+                continue
+            if absorbed is not None and placed.map_id == absorbed.map_id:
+                self._frames[row] = placed.scaled(absorbed.scale, update.map_id)
+            elif placed.map_id == update.map_id:
+                self._frames[row] = placed.scaled(update.scales.get(placed.reference_id, 1.0), update.map_id)
 
     def _drop(self, map_id: int) -> None:
         """Forget a map and the places of frames in it."""

@@ -9,7 +9,7 @@ from thegra_core.config import MappingConfig
 from thegra_core.geometry import poses
 from thegra_core.geometry.camera import CameraModel, DistortionModel
 from thegra_core.map.editor import MapEditor
-from thegra_core.map.map import MapKeyframe, make_keyframe
+from thegra_core.map.map import MapKeyframe, make_keyframes
 from thegra_core.mapping.expansion import accept_points, expand
 from thegra_core.messages import NO_LANDMARK, Features, Keyframe, Matches
 
@@ -30,7 +30,8 @@ def pair(points: np.ndarray, second: np.ndarray | None = None, shift_px: np.ndar
     first_pixels = points[:, :2] / points[:, 2:] * FOCAL + [320, 256]
     moved = poses.apply(poses.inverse(pose), points)
     second_pixels = moved[:, :2] / moved[:, 2:] * FOCAL + [320, 256] + (0 if shift_px is None else shift_px)
-    return make_keyframe(message(1, np.eye(4), first_pixels), CAMERA), make_keyframe(message(0, pose, second_pixels), CAMERA)
+    first, second = make_keyframes([message(1, np.eye(4), first_pixels), message(0, pose, second_pixels)], CAMERA)
+    return first, second
 
 
 def accepted(keyframe: MapKeyframe, neighbour: MapKeyframe, config: MappingConfig = CONFIG) -> list[bool]:

@@ -163,7 +163,7 @@ def test_files_that_do_not_fit_say_what_to_do(kept: Path, tmp_path: Path) -> Non
     mapper = Mapper(CAMERA, CONFIG, FakeMatcher())
     with pytest.raises(InputError, match=r"has version 99 of the map format.*reads version 1"):
         mapper.load(rewritten(kept, tmp_path / "v.map", format_version=99))
-    with pytest.raises(InputError, match="made with superpoint features, this run uses aliked.*--set extractor.name=superpoint"):
+    with pytest.raises(InputError, match=r"made with superpoint features, this run uses aliked.*--set extractor.name=superpoint"):
         mapper.load(rewritten(kept, tmp_path / "e.map", extractor="superpoint"))
     with pytest.raises(InputError, match="is no map file of Thegra"):
         mapper.load(rewritten(kept, tmp_path / "f.map", format="other"))

@@ -93,12 +93,12 @@ def place_map(scale=1.0, shift=(0.0, 0.0, 0.0)):
 
 def test_sighting_finds_pose_and_scale():
     editor, truth = place_map(scale=1.25, shift=(0.4, -0.2, 0.3))
-    found = sight(editor.map, 10, [0, 1, 2], FakeMatcher(wrong=0.2), CONFIG)
+    found = sight(editor.map, 10, editor.map, [0, 1, 2], FakeMatcher(wrong=0.2), CONFIG)
     assert isinstance(found, Sighting)
     assert found.world_from_camera.scale == pytest.approx(1 / 1.25, rel=0.01)
     np.testing.assert_allclose(found.world_from_camera.rigid, truth[10], atol=0.01)
     assert len(found.keypoints) == len(set(found.landmarks.tolist())) > CONFIG.loop.min_inliers
-    other = sight(editor.map, 11, [1, 2], FakeMatcher(), CONFIG)
+    other = sight(editor.map, 11, editor.map, [1, 2], FakeMatcher(), CONFIG)
     assert isinstance(other, Sighting)
     assert agree(editor.map, found, other, CONFIG)
     turned = replace(other, world_from_camera=Similarity(other.world_from_camera.rigid @ look((0, 0, 0), 6), other.world_from_camera.scale))
@@ -111,12 +111,12 @@ def test_another_place_is_refused_with_the_reason():
     editor, _ = place_map()
     elsewhere = observe(make_world(WORLD.points, seed=99), look((0, 0, 0)), stamp(50))
     editor.add_keyframe(Keyframe(50, stamp(50), look((0, 0, 0)), elsewhere, np.full(len(elsewhere), NO_LANDMARK, np.int64), -1, 0))
-    assert sight(editor.map, 50, [0], FakeMatcher(), CONFIG) == "0 matches"
-    assert "inliers of" in str(sight(editor.map, 10, [0], FakeMatcher(wrong=1.0), CONFIG))
+    assert sight(editor.map, 50, editor.map, [0], FakeMatcher(), CONFIG) == "0 matches"
+    assert "inliers of" in str(sight(editor.map, 10, editor.map, [0], FakeMatcher(wrong=1.0), CONFIG))
 
 
 def test_a_keyframe_without_landmarks_of_its_own_tells_no_scale():
     editor, _ = place_map()
     bare = observe(WORLD, look((0.1, 0, 0)), stamp(60))
     editor.add_keyframe(Keyframe(60, stamp(60), look((0.1, 0, 0)), bare, np.full(len(bare), NO_LANDMARK, np.int64), -1, 0))
-    assert sight(editor.map, 60, [0, 1], FakeMatcher(), CONFIG) == "0 landmarks of both places"
+    assert sight(editor.map, 60, editor.map, [0, 1], FakeMatcher(), CONFIG) == "0 landmarks of both places"

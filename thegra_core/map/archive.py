@@ -19,7 +19,9 @@ from thegra_core.errors import InputError
 Arrays = dict[str, NDArray[Any]]
 
 _HEADER = "header.json"
-_LEVEL = 1  # of deflate: descriptors hardly compress, and a robot waits
+_LEVEL = 1  # of deflate: more gains little, and a robot waits
+_SAMPLE_BYTES = 1 << 16
+_WORTH = 0.8
 
 
 def write_archive(path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -35,7 +37,9 @@ def write_archive(path: Path, header: Mapping[str, Any], arrays: Mapping[str, ND
                 with archive.open(_HEADER, "w") as member:
                     member.write(json.dumps(dict(header), indent=1, sort_keys=True).encode())
                 for name, values in arrays.items():
-                    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    info = zipfile.ZipInfo(f"{name}.npy")  # with the date that all zip files begin at: the same content gives the same bytes
+                    info.compress_type = zipfile.ZIP_DEFLATED if _compresses(values) else zipfile.ZIP_STORED
+                    with archive.open(info, "w", force_zip64=True) as member:
                         np.lib.format.write_array(member, np.ascontiguousarray(values), allow_pickle=False)
             stream.flush()
             os.fsync(stream.fileno())
@@ -91,6 +95,12 @@ def _header(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
     if not isinstance(header, dict):
         raise InputError(f"{path} is a zip file but no map file")
     return header
+
+
+def _compresses(values: NDArray[Any]) -> bool:
+    """Whether deflate makes less of an array, by a sample of it: descriptors, which are most of a map, are nearly random numbers."""
+    sample = np.ascontiguousarray(values).reshape(-1)[: max(1, _SAMPLE_BYTES // max(values.itemsize, 1))].tobytes()
+    return len(zlib.compress(sample, _LEVEL)) < _WORTH * len(sample)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.geometry.camera import CameraModel
-from thegra_core.map.map import Map, make_keyframe
-from thegra_core.messages import NO_LANDMARK, Keyframe, KeyframeState, LandmarkArrays, MapUpdate
+from thegra_core.geometry.similarity import Similarity
+from thegra_core.map.map import Map, make_keyframes
+from thegra_core.messages import NO_LANDMARK, Absorbed, Keyframe, KeyframeState, LandmarkArrays, MapUpdate
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -44,7 +46,7 @@ class MapEditor:
         map_id: int,
         camera: CameraModel,
         covisibility_threshold: int,
-        keyframes: Iterable[Keyframe],
+        keyframes: Sequence[Keyframe],
         landmarks: LandmarkArrays,
         covisibility: Mapping[int, tuple[tuple[int, int], ...]],
         counts: tuple[IntArray, IntArray, IntArray],
@@ -59,10 +61,10 @@ class MapEditor:
         editor = cls(map_id, camera, covisibility_threshold)
         ids = landmarks.ids.tolist()
         editor.observers = {i: {} for i in ids}
+        editor.map.keyframes = {keyframe.id: keyframe for keyframe in make_keyframes(keyframes, camera)}
+        editor._new.extend(keyframes)
+        editor._keyframes.update(editor.map.keyframes)
         for message in keyframes:
-            editor.map.keyframes[message.id] = make_keyframe(message, camera)
-            editor._new.append(message)
-            editor._keyframes.add(message.id)
             for feature in np.flatnonzero(message.landmark_ids != NO_LANDMARK).tolist():
                 editor.observers[int(message.landmark_ids[feature])][message.id] = feature
         editor.map.landmarks.put(landmarks)
@@ -79,7 +81,7 @@ class MapEditor:
 
     def add_keyframe(self, message: Keyframe) -> None:
         """Insert a keyframe with those of its observations whose landmarks still live."""
-        keyframe = make_keyframe(message, self.map.camera)
+        (keyframe,) = make_keyframes([message], self.map.camera)
         wanted = keyframe.landmark_ids.copy()
         keyframe.landmark_ids[:] = NO_LANDMARK
         self.map.keyframes[message.id] = keyframe
@@ -172,6 +174,34 @@ class MapEditor:
         for keyframe_id, scale in scales.items():
             self._scales[keyframe_id] = self._scales.get(keyframe_id, 1.0) * scale
 
+    def absorb(self, other: MapEditor, self_from_other: Similarity) -> dict[int, int]:
+        """Take in all of another map, whose world this one sees by `self_from_other`; its landmarks get the new ids that are returned.
+
+        Keyframe ids must differ. The other editor is of no use afterwards. All of both maps counts as changed.
+        """
+        theirs = other.map.landmarks.get(other.map.landmarks.alive_ids())
+        new_ids = np.arange(self._next_landmark, self._next_landmark + len(theirs), dtype=np.int64)
+        self._next_landmark += len(theirs)
+        renamed = dict(zip(theirs.ids.tolist(), new_ids.tolist(), strict=True))
+        self.map.landmarks.put(replace(theirs, ids=new_ids, points_world=self_from_other.apply(theirs.points_world)))
+        for old, new in renamed.items():
+            self.observers[new] = other.observers[old]
+            self.first_keyframe[new] = other.first_keyframe[old]
+            self.visible[new], self.found[new] = other.visible[old], other.found[old]
+        for keyframe in other.map.keyframes.values():
+            seen = keyframe.landmark_ids != NO_LANDMARK
+            keyframe.landmark_ids[seen] = [renamed[i] for i in keyframe.landmark_ids[seen].tolist()]
+            keyframe.world_from_camera = (self_from_other @ Similarity(keyframe.world_from_camera)).rigid
+            self.map.keyframes[keyframe.id] = keyframe
+        self.map.covisibility.update(other.map.covisibility)
+        self._new = [
+            Keyframe(k.id, k.stamp_ns, k.world_from_camera, k.features, k.landmark_ids, k.reference_id, self.map.map_id) for k in self.map.keyframes.values()
+        ]
+        self._keyframes.update(self.map.keyframes)
+        self._landmarks.update(self.map.landmarks.alive_ids().tolist())
+        self._edges.update(self.map.covisibility)
+        return renamed
+
     def place(self, landmark: int, point_world: FloatArray) -> None:
         """Set the position (3,) of one landmark."""
         self.map.landmarks.points_world[self.map.landmarks.rows(np.array([landmark]))] = point_world
@@ -252,7 +282,7 @@ class MapEditor:
         store.column("depth_max")[rows] = depth_max
         store.column("scores")[rows] = scores / count
 
-    def take_update(self, correction: FloatArray | None = None) -> MapUpdate:
+    def take_update(self, absorbed: Absorbed | None = None) -> MapUpdate:
         """Everything that changed since the last call, as a message; derived data is renewed first."""
         self.refresh()
         self.map.version += 1
@@ -268,7 +298,7 @@ class MapEditor:
             landmarks=self.map.landmarks.get(ids) if len(ids) else None,
             removed_landmark_ids=np.array(sorted(self._removed), dtype=np.int64),
             covisibility={i: self.map.covisibility[i] for i in sorted(self._edges)},
-            correction=correction,
+            absorbed=absorbed,
             scales=dict(self._scales),
         )
         self._new, self._scales = [], {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,17 +39,24 @@ class MapKeyframe:
         return np.asarray(self.world_from_camera[:3, 3])
 
 
-def make_keyframe(message: Keyframe, camera: CameraModel) -> MapKeyframe:
-    """The map's form of a keyframe message; keypoints whose pixel the camera model cannot undistort get NaN coordinates."""
-    return MapKeyframe(
-        id=message.id,
-        stamp_ns=message.stamp_ns,
-        world_from_camera=message.world_from_camera.copy(),
-        features=message.features,
-        normalized=camera.undistort(message.features.keypoints.astype(np.float64)),
-        landmark_ids=message.landmark_ids.copy(),
-        reference_id=message.reference_id,
-    )
+def make_keyframes(messages: Sequence[Keyframe], camera: CameraModel) -> list[MapKeyframe]:
+    """The map's form of keyframe messages; keypoints whose pixel the camera model cannot undistort get NaN coordinates."""
+    if not messages:
+        return []
+    normalized = camera.undistort(np.concatenate([m.features.keypoints for m in messages]).astype(np.float64))
+    parts = np.split(normalized, np.cumsum([len(m.features) for m in messages])[:-1])
+    return [
+        MapKeyframe(
+            id=message.id,
+            stamp_ns=message.stamp_ns,
+            world_from_camera=message.world_from_camera.copy(),
+            features=message.features,
+            normalized=part,
+            landmark_ids=message.landmark_ids.copy(),
+            reference_id=message.reference_id,
+        )
+        for message, part in zip(messages, parts, strict=True)
+    ]
 
 
 class Map:
@@ -102,8 +110,7 @@ class Map:
         for keyframe_id in update.removed_keyframe_ids:
             self.keyframes.pop(keyframe_id, None)
             self.covisibility.pop(keyframe_id, None)
-        for message in update.new_keyframes:
-            self.keyframes[message.id] = make_keyframe(message, self.camera)
+        self.keyframes.update((keyframe.id, keyframe) for keyframe in make_keyframes(update.new_keyframes, self.camera))
         for state in update.keyframes:
             keyframe = self.keyframes[state.id]
             keyframe.world_from_camera = state.world_from_camera

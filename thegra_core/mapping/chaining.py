@@ -25,6 +25,10 @@ class MatchGraph:
         self._edges.setdefault(keyframe_id, {})[other_id] = matches
         self._edges.setdefault(other_id, {})[keyframe_id] = reversed_matches(matches)
 
+    def absorb(self, other: MatchGraph) -> None:
+        """Take in the matches between other keyframes."""
+        self._edges.update(other._edges)
+
     def arrays(self) -> Arrays:
         """All matches for a map file: one row of `edges` (keyframe, other) and one stretch of `indices` and `confidence` a pair."""
         edges = [(i, other) for i in sorted(self._edges) for other in sorted(self._edges[i]) if i > other]

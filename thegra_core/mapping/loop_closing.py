@@ -58,7 +58,7 @@ class LoopCloser:
         connected = list(dict.fromkeys([*direct, *(second for first in direct for second in current.neighbours(first, len(current.keyframes)))]))
         for candidate in self.index.candidates(keyframe_id, connected)[:1]:
             near = [i for i in current.neighbours(candidate, len(current.keyframes)) if i not in connected]
-            found = sight(current, keyframe_id, [candidate, *near[: self.config.loop.group - 1]], self.matcher, self.config)
+            found = sight(current, keyframe_id, current, [candidate, *near[: self.config.loop.group - 1]], self.matcher, self.config)
             if isinstance(found, Sighting):
                 return found
             logger.debug("keyframe %d looks like %d: %s", keyframe_id, candidate, found)
@@ -75,7 +75,7 @@ def _close(editor: MapEditor, sightings: list[Sighting], graph: MatchGraph, conf
     for sighting in sightings:
         for other, matches in sighting.matches.items():
             graph.add(sighting.keyframe_id, other, matches)
-        _fuse(editor, sighting)
+        fuse_sighting(editor, sighting)
     concerned = {i for sighting in sightings for i in (sighting.keyframe_id, *sighting.matches)}
     for keyframe_id in sorted(concerned | {n for i in concerned for n in current.neighbours(i, ESSENTIAL_NEIGHBOURS)}):
         editor.connect(keyframe_id)
@@ -119,8 +119,8 @@ def _carrier(editor: MapEditor, landmark: int) -> int:
     return first if first in editor.map.keyframes else min(editor.observers[landmark])
 
 
-def _fuse(editor: MapEditor, sighting: Sighting) -> None:
-    """The old landmarks take the place of the new ones."""
+def fuse_sighting(editor: MapEditor, sighting: Sighting) -> None:
+    """The old landmarks of a sighting take the place of the new ones."""
     own = editor.map.keyframes[sighting.keyframe_id].landmark_ids
     for keypoint, old in zip(sighting.keypoints.tolist(), sighting.landmarks.tolist(), strict=True):
         new = int(own[keypoint])

@@ -17,8 +17,9 @@ from thegra_core.mapping.adjustment import adjust_all, adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
 from thegra_core.mapping.expansion import expand
 from thegra_core.mapping.loop_closing import LoopCloser
+from thegra_core.mapping.merging import MapMerger, merge
 from thegra_core.mapping.persistence import KeptMap, load_map, save_map
-from thegra_core.messages import InitialMap, Keyframe, MapSummary, MapUpdate, Matches
+from thegra_core.messages import Absorbed, InitialMap, Keyframe, MapSummary, MapUpdate, Matches
 
 logger = logging.getLogger(__name__)
 
@@ -34,6 +35,8 @@ class Mapper:
         self._trial: dict[int, list[int]] = {}
         self._graphs: dict[int, MatchGraph] = {}
         self._loops: dict[int, LoopCloser] = {}
+        self._merger = MapMerger(config, matcher)
+        self.merges = 0
 
     def initialize(self, initial: InitialMap) -> MapUpdate:
         """Begin a map from what the initializer solved; its bundle adjustment has been done."""
@@ -71,6 +74,9 @@ class Mapper:
         editor.connect(keyframe.id)
         if self._config.loop.enabled:
             self._loops[keyframe.map_id].add(editor, keyframe.id, self._graphs[keyframe.map_id])
+            merged = self._merge(editor, keyframe.id)
+            if merged is not None:
+                return merged
         return editor.take_update()
 
     def finish(self, map_id: int) -> MapUpdate:
@@ -130,6 +136,28 @@ class Mapper:
             points_world=landmarks.points_world if landmarks is not None else np.empty((0, 3)),
             point_scores=landmarks.scores if landmarks is not None else np.empty(0, np.float32),
         )
+
+    def _merge(self, editor: MapEditor, keyframe_id: int) -> MapUpdate | None:
+        """The whole of an older map that a map has become part of, if this keyframe ties them."""
+        map_id = editor.map.map_id
+        others = {i: (self._editors[i].map, self._loops[i].index) for i in self._editors if i != map_id}
+        tie = self._merger.find(editor.map, keyframe_id, others)
+        if tie is None:
+            return None
+        old, similarity = self._editors[tie.old_map_id], tie.old_from_new(editor.map)
+        renamed = merge(old, editor, tie, self._config)
+        graph = self._graphs[tie.old_map_id]
+        graph.absorb(self._graphs[map_id])
+        for sighting in tie.sightings:
+            for other, matches in sighting.matches.items():
+                graph.add(sighting.keyframe_id, other, matches)
+        for i, keyframe in sorted(editor.map.keyframes.items()):
+            self._loops[tie.old_map_id].index.add(i, keyframe.features)
+        self._loops[tie.old_map_id].closed += self._loops[map_id].closed
+        self._trial[tie.old_map_id].extend(renamed[i] for i in self._trial[map_id] if i in renamed)
+        self.drop(map_id)
+        self.merges += 1
+        return old.take_update(Absorbed(map_id, similarity.rigid, similarity.scale))
 
     def _cull(self, editor: MapEditor, keyframe: Keyframe) -> None:
         trial = self._trial[keyframe.map_id]

@@ -54,7 +54,7 @@ def final_trajectory(run: Run, map_id: int) -> Trajectory:
 
 def live_trajectory(run: Run, map_id: int) -> Trajectory:
     """Frames of one map as they were estimated at the time (causal); what was localised afterwards is not among them."""
-    return make_trajectory((f.stamp_ns, f.world_from_camera_live) for f in run.frames if f.map_id == map_id and f.world_from_camera_live is not None)
+    return make_trajectory((f.stamp_ns, f.world_from_camera_live) for f in run.frames if f.map_id == f.result.map_id == map_id and f.world_from_camera_live is not None)
 
 
 def predicted_trajectory(run: Run, map_id: int) -> Trajectory:

@@ -48,11 +48,17 @@ class PlaceIndex:
 
     def query(self, features: Features, most: int) -> list[int]:
         """At most `most` keyframes that look most like an image that is none of them, the most similar first."""
-        if self._vocabulary is None:
+        similar = self._similar(features)
+        return sorted(similar, key=lambda i: (-similar[i], i))[:most]
+
+    def alike(self, features: Features, near: Sequence[Features]) -> list[int]:
+        """Keyframes that look nearly as much like an image that is none of them as the images `near` it do, the most similar first."""
+        if self._vocabulary is None or not near:
             return []
-        ids = np.array(list(self._rows))
-        similar = self._vectors[: len(ids)] @ describe(features, self._vocabulary)
-        return [int(i) for i in ids[np.argsort(-similar, kind="stable")[:most]]]
+        vector = describe(features, self._vocabulary)
+        bar = self._config.similarity_share * float(np.median([vector @ describe(other, self._vocabulary) for other in near]))
+        similar = self._similar(features)
+        return sorted((i for i, value in similar.items() if value >= bar), key=lambda i: (-similar[i], i))
 
     def arrays(self) -> Arrays:
         """Words and vectors for a map file; nothing before there are words."""
@@ -82,6 +88,11 @@ class PlaceIndex:
         bar = self._config.similarity_share * float(np.median(near))
         found = [(value, i) for i, value in similar.items() if value >= bar and i != keyframe_id and i not in connected]
         return [i for _, i in sorted(found, reverse=True)]
+
+    def _similar(self, features: Features) -> dict[int, float]:
+        if self._vocabulary is None:
+            return {}
+        return dict(zip(self._rows, (self._vectors[: len(self._rows)] @ describe(features, self._vocabulary)).tolist(), strict=True))
 
     def _append(self, keyframe_id: int, features: Features) -> None:
         assert self._vocabulary is not None

@@ -35,21 +35,24 @@ class Sighting:
     matches: Mapping[int, Matches]
 
 
-def sight(current: Map, keyframe_id: int, group: list[int], matcher: Matcher, config: ThegraConfig) -> Sighting | str:
-    """Place a keyframe by the landmarks of `group`, the candidate first; a string says why that failed."""
+def sight(new: Map, keyframe_id: int, old: Map, group: list[int], matcher: Matcher, config: ThegraConfig) -> Sighting | str:
+    """Place a keyframe of `new` by the landmarks of `group`, keyframes of `old`, the candidate first; a string says why that failed.
+
+    Both are the same map for a loop, and two maps where they may be one world.
+    """
     settings = config.loop
-    keyframe = current.keyframes[keyframe_id]
-    first = matcher.match(keyframe.features, current.keyframes[group[0]].features)
+    keyframe = new.keyframes[keyframe_id]
+    first = matcher.match(keyframe.features, old.keyframes[group[0]].features)
     if len(first) < settings.min_matches:
         return f"{len(first)} matches"
-    others = matcher.match_many(keyframe.features, [current.keyframes[i].features for i in group[1:]])
+    others = matcher.match_many(keyframe.features, [old.keyframes[i].features for i in group[1:]])
     matched = dict(zip(group, [first, *others], strict=True))
     defined = np.asarray(np.isfinite(keyframe.normalized).all(axis=1))
-    keypoints, landmarks = inherited_landmarks(current, matched, defined)
+    keypoints, landmarks = inherited_landmarks(old, matched, defined)
     if len(keypoints) < settings.min_inliers:
         return f"{len(keypoints)} matches with landmarks"
-    points = current.landmarks.points_world[current.landmarks.rows(landmarks)]
-    focal = current.camera.focal
+    points = old.landmarks.points_world[old.landmarks.rows(landmarks)]
+    focal = old.camera.focal
     start, found = estimate_pose(points, keyframe.normalized[keypoints], focal, RANSAC_THRESHOLD_PX, config.seed)
     if found < settings.min_inliers:
         return f"{found} inliers of {len(keypoints)} matches with landmarks"
@@ -58,19 +61,19 @@ def sight(current: Map, keyframe_id: int, group: list[int], matcher: Matcher, co
     keypoints, landmarks, points = keypoints[estimate.inliers], landmarks[estimate.inliers], points[estimate.inliers]
     if len(keypoints) < settings.min_inliers:
         return f"{len(keypoints)} landmarks agree with one pose"
-    scale = _scale(current, keyframe, keypoints, poses.apply(estimate.camera_from_world, points)[:, 2], config)
+    scale = _scale(new, keyframe, keypoints, poses.apply(estimate.camera_from_world, points)[:, 2], config)
     if isinstance(scale, str):
         return scale
     return Sighting(keyframe_id, Similarity(poses.inverse(estimate.camera_from_world), scale), keypoints, landmarks, matched)
 
 
-def agree(current: Map, one: Sighting, other: Sighting, config: ThegraConfig) -> bool:
-    """Whether two keyframes of the new part are moved alike by their sightings of the old one."""
+def agree(new: Map, one: Sighting, other: Sighting, config: ThegraConfig) -> bool:
+    """Whether two keyframes of the new map or part are moved alike by their sightings of the old one."""
     settings = config.loop
-    correction = one.world_from_camera @ Similarity(current.keyframes[one.keyframe_id].world_from_camera).inverse()
-    expected = correction @ Similarity(current.keyframes[other.keyframe_id].world_from_camera)
+    correction = one.world_from_camera @ Similarity(new.keyframes[one.keyframe_id].world_from_camera).inverse()
+    expected = correction @ Similarity(new.keyframes[other.keyframe_id].world_from_camera)
     difference = expected.inverse() @ other.world_from_camera
-    depth = current.median_depth(other.keyframe_id)
+    depth = new.median_depth(other.keyframe_id)
     return bool(
         np.degrees(poses.rotation_angle(difference.rigid[:3, :3])) <= settings.max_rotation_deg
         and float(np.linalg.norm(difference.rigid[:3, 3])) <= settings.max_translation_ratio * depth
@@ -78,10 +81,10 @@ def agree(current: Map, one: Sighting, other: Sighting, config: ThegraConfig) ->
     )
 
 
-def _scale(current: Map, keyframe: MapKeyframe, keypoints: IntArray, old_depth: NDArray[np.float64], config: ThegraConfig) -> float | str:
+def _scale(new: Map, keyframe: MapKeyframe, keypoints: IntArray, old_depth: NDArray[np.float64], config: ThegraConfig) -> float | str:
     """Old over new depth of the keypoints that have a landmark in both parts."""
-    rows = current.landmarks.rows(keyframe.landmark_ids[keypoints])
-    new_depth = poses.apply(keyframe.camera_from_world, current.landmarks.points_world[np.maximum(rows, 0)])[:, 2]
+    rows = new.landmarks.rows(keyframe.landmark_ids[keypoints])
+    new_depth = poses.apply(keyframe.camera_from_world, new.landmarks.points_world[np.maximum(rows, 0)])[:, 2]
     use = (rows >= 0) & (new_depth > 0) & (old_depth > 0)
     if use.sum() < config.loop.min_scale_pairs:
         return f"{int(use.sum())} landmarks of both places"

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.geometry import poses
+from thegra_core.geometry.similarity import Similarity
 
 FloatArray = NDArray[np.float64]
 
@@ -27,12 +28,12 @@ class MotionModel:
         """Forget all poses."""
         self._previous = self._last = self._covariance = None
 
-    def move(self, new_world_from_world: FloatArray) -> None:
-        """The world was corrected: carry the remembered poses along with a rigid transform (4, 4)."""
+    def move(self, new_from_old: Similarity) -> None:
+        """The world was corrected, or became part of another: carry the remembered poses along."""
         if self._previous is not None:
-            self._previous = (self._previous[0], new_world_from_world @ self._previous[1])
+            self._previous = (self._previous[0], (new_from_old @ Similarity(self._previous[1])).rigid)
         if self._last is not None:
-            self._last = (self._last[0], new_world_from_world @ self._last[1])
+            self._last = (self._last[0], (new_from_old @ Similarity(self._last[1])).rigid)
 
     def predict(self, stamp_ns: int) -> FloatArray | None:
         """world_from_camera (4, 4) at a stamp at the last velocity; the last pose if there is no velocity; None without any pose."""

@@ -13,8 +13,20 @@ from thegra_core.config import ThegraConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry import poses
 from thegra_core.geometry.camera import CameraModel
+from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.map import Map
-from thegra_core.messages import NO_LANDMARK, Features, InitialMap, Keyframe, MapUpdate, Matches, TrackingResult, TrackingState, VisibilityCounts
+from thegra_core.messages import (
+    NO_LANDMARK,
+    Absorbed,
+    Features,
+    InitialMap,
+    Keyframe,
+    MapUpdate,
+    Matches,
+    TrackingResult,
+    TrackingState,
+    VisibilityCounts,
+)
 from thegra_core.places.index import PlaceIndex
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
@@ -159,8 +171,11 @@ class TrackingStage:
     def apply(self, update: MapUpdate) -> None:
         """Bring the replica up to date; the newest keyframe becomes the reference and the motion model follows its correction.
 
-        Updates of a map that was dropped in the meantime are ignored.
+        Updates of a map that was dropped in the meantime are ignored. Where the current map has become part of another, tracking goes on in that.
         """
+        if update.absorbed is not None:
+            self._move_into(update, update.absorbed)
+            return
         for place in (self._place, self._before):
             if place is not None and place.map.map_id == update.map_id:
                 break
@@ -173,7 +188,22 @@ class TrackingStage:
         if before:
             newest = max(before)
             place.reference_id = place.last_keyframe_id = newest
-            place.motion.move(place.map.keyframes[newest].world_from_camera @ poses.inverse(before[newest]))
+            corrected = Similarity(place.map.keyframes[newest].world_from_camera, update.scales.get(newest, 1.0))
+            place.motion.move(corrected @ Similarity(before[newest]).inverse())
+
+    def _move_into(self, update: MapUpdate, absorbed: Absorbed) -> None:
+        """Go on in the map that has taken in the current one; that the two fit proves the current one."""
+        place = self._place
+        if place is None or place.map.map_id != absorbed.map_id:
+            return
+        place.map, place.places = Map(update.map_id, self._camera), self._place_index()
+        place.map.apply(update)
+        for message in update.new_keyframes:
+            place.places.add(message.id, message.features)
+        place.motion.move(Similarity(absorbed.rigid, absorbed.scale))
+        place.reference_id = place.last_keyframe_id = max(m.id for m in update.new_keyframes)
+        place.probation, self._before = 0, None
+        place.visible, place.found = [], []
 
     def drop_unproven(self) -> int | None:
         """At the end of a run: give up a map that is still on probation; its id, or None."""
