@@ -1,4 +1,4 @@
-"""Which triangle a ray meets first: trimesh with Embree."""
+"""Which triangle a ray meets first: Embree, through embreex."""
 
 from __future__ import annotations
 
@@ -15,27 +15,31 @@ IntArray = NDArray[np.int64]
 
 
 class RayCaster:
-    """Embree's tree over a scene's triangles.
+    """Embree's tree over a scene's triangles. It works in float32; who needs the exact hit meets the triangle's plane in float64.
 
     Raises:
-        InputError: If trimesh or embreex is not installed.
+        InputError: If embreex is not installed.
     """
 
     def __init__(self, scene: Scene) -> None:
         try:
-            import trimesh
-            from trimesh.ray.ray_pyembree import RayMeshIntersector
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
         except ImportError as error:
             raise InputError(f"simulated scenes need trimesh and embreex ({error}); install them with: pip install trimesh embreex") from error
-        mesh = trimesh.Trimesh(scene.vertices, scene.faces, process=False, validate=False)
-        self._rays: Any = RayMeshIntersector(mesh)
+        self._scene: Any = EmbreeScene()
+        TriangleMesh(self._scene, scene.vertices.astype(np.float32), scene.faces.astype(np.int32))
 
     def first_hit(self, origins: FloatArray, directions: FloatArray) -> IntArray:
         """Index (N,) of the first triangle along rays from origins (N, 3) in directions (N, 3), -1 where there is none or a direction is NaN."""
-        hits: IntArray = np.full(len(directions), -1, dtype=np.int64)
         known = np.isfinite(directions).all(axis=1)
         if known.all():
-            hits[:] = self._rays.intersects_first(origins, directions)
-        elif known.any():
-            hits[known] = self._rays.intersects_first(origins[known], directions[known])
+            return self._run(origins, directions)
+        hits: IntArray = np.full(len(directions), -1, dtype=np.int64)
+        if known.any():
+            hits[known] = self._run(origins[known], directions[known])
+        return hits
+
+    def _run(self, origins: FloatArray, directions: FloatArray) -> IntArray:
+        hits: IntArray = np.asarray(self._scene.run(origins.astype(np.float32), directions.astype(np.float32)), dtype=np.int64)
         return hits

@@ -8,7 +8,10 @@ from typing import Literal
 
 from thegra_core.simulation.routes import Route
 from thegra_core.simulation.scene import Scene
+from thegra_core.simulation.scenes.corridor import corridor, corridor_route
 from thegra_core.simulation.scenes.room import room, room_route
+from thegra_core.simulation.scenes.street import street, street_route
+from thegra_core.simulation.scenes.tunnel import tunnel, tunnel_route
 
 SceneName = Literal["room", "corridor", "street", "tunnel"]
 
@@ -22,4 +25,9 @@ class SceneKind:
     outdoors: bool = False
 
 
-SCENES: dict[SceneName, SceneKind] = {"room": SceneKind(room, room_route)}
+SCENES: dict[SceneName, SceneKind] = {
+    "room": SceneKind(room, room_route),
+    "corridor": SceneKind(corridor, corridor_route),
+    "street": SceneKind(street, street_route, outdoors=True),
+    "tunnel": SceneKind(tunnel, tunnel_route),
+}
