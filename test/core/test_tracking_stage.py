@@ -9,6 +9,7 @@ from synthetic import CAMERA, FakeMatcher, World, cloud, loop, no_features, obse
 from thegra_core.config import ThegraConfig
 from thegra_core.geometry import poses
 from thegra_core.geometry.alignment import umeyama
+from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.messages import Features, MapUpdate, TrackingState
@@ -391,7 +392,7 @@ def test_motion_model_by_hand() -> None:
     np.testing.assert_allclose(predicted[:3, :3], poses.so3_exp([0, 0, 0.4]), atol=1e-12)
     np.testing.assert_allclose(predicted[:3, 3], [2.0, 0, 0])
     np.testing.assert_allclose(model.twist(), [0, 0, 0.4, 1.0, 0, 0], atol=1e-12)
-    model.move(poses.transform(np.eye(3), [0, 10.0, 0]))
+    model.move(Similarity(poses.transform(np.eye(3), [0, 10.0, 0])))
     np.testing.assert_allclose(model.predict(1_500_000_000)[:3, 3], [1.5, 10, 0], atol=1e-12)
     np.testing.assert_allclose(model.twist(), [0, 0, 0.4, 1.0, 0, 0], atol=1e-12)
     assert model.predicted_covariance(2_000_000_000) is None
