@@ -41,11 +41,11 @@ class Style:
 
 
 STYLES: dict[StyleName, Style] = {
-    "robust": Style(1.0, (10.0, 5.0), (5.0, 9.0), (0.15, 0.06), 0.15, 0.003, (0.5, 2.0)),
+    "robust": Style(1.0, (6.0, 4.0), (5.0, 9.0), (0.15, 0.06), 0.15, 0.003, (0.5, 2.0)),
     "unstable": Style(1.3, (14.0, 8.0), (3.0, 6.0), (0.2, 0.1), 0.9, 0.012, (0.8, 3.0)),
     "aggressive": Style(2.2, (32.0, 12.0), (1.8, 3.0), (0.35, 0.2), 0.4, 0.008, (0.8, 3.0)),
 }
-"""Turn rates (95 % of the time below): robust 25, unstable 60, aggressive 130 degrees a second."""
+"""Turn rates in the room (95 % of the time below): robust 30, unstable 70, aggressive 140 degrees a second."""
 
 
 class HandHeldPath:
@@ -114,7 +114,7 @@ def _walk(way: Way, route: Route, style: Style, times: FloatArray, hold: float, 
     """Positions (N, 3) along the route, with sway, and unit gaze (N, 3) before any swing."""
     speed = route.speed_m_s * style.pace
     start = rng.uniform(0, way.length_m)
-    arc = start + speed * (times + 0.5 * _slow(times, style, rng) * hold)
+    arc = start + speed * (times + 0.3 * _slow(times, style, rng) * hold)
     feet = way.at(arc)
     tangent = way.at(arc + 0.2) - way.at(arc - 0.2)
     side = np.cross([0.0, 0.0, 1.0], tangent / np.linalg.norm(tangent, axis=1, keepdims=True))

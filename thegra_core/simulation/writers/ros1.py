@@ -6,6 +6,7 @@ Ground truth is the camera's pose; the sets' own is that of a marker, LiDAR or v
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime, timedelta, timezone
@@ -138,13 +139,10 @@ def _note(truth: list[tuple[int, FloatArray]], tick: Tick) -> None:
         truth.append((tick.stamp_ns, tick.world_from_camera))
 
 
-def _split(ticks: Iterator[Tick], length_ns: int) -> Iterator[list[Tick]]:
-    """Ticks in pieces of `length_ns`."""
-    piece: list[Tick] = []
-    for tick in ticks:
-        if piece and tick.stamp_ns - piece[0].stamp_ns >= length_ns:
-            yield piece
-            piece = []
-        piece.append(tick)
-    if piece:
-        yield piece
+def _split(ticks: Iterator[Tick], length_ns: int) -> Iterator[Iterator[Tick]]:
+    """Ticks in pieces of `length_ns`, each to be taken before the next."""
+    first = next(ticks, None)
+    if first is None:
+        return
+    for _, part in itertools.groupby(itertools.chain([first], ticks), lambda tick: (tick.stamp_ns - first.stamp_ns) // length_ns):
+        yield part
