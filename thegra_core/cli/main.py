@@ -117,6 +117,9 @@ def score(
     images: Annotated[Path | None, typer.Option(metavar="FILE", help="List with a stamp first on each line: the frames that count. Default: the ground truth's.")] = None,
     shutter: Annotated[Path | None, typer.Option(metavar="FILE", help="`begin end` of each shutter closure; frames inside are not scored.")] = None,
     tolerance: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="Farthest stamp that belongs to a frame. Default: half a frame period.")] = None,
+    max_gap: Annotated[float, typer.Option(metavar="S", min=0.0, help="The ground truth is interpolated in gaps up to this; 0: only its nearest pose, as evo does.")] = 0.5,
+    fit_lever_arm: Annotated[bool, typer.Option("--fit-lever-arm", help="Fit the camera's place on the body that the ground truth tells of.")] = False,
+    fit_time_offset: Annotated[bool, typer.Option("--fit-time-offset", help="Fit the offset of the ground truth's clock, +-0.5 s, by the rotation rates.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Score a trajectory against ground truth: coverage, ATE and RPE after Sim(3) alignment.
@@ -124,8 +127,10 @@ def score(
     Example: `thegra score runs/flight/trajectory.txt groundtruth.txt --images images.txt`
     """
     from thegra_core.cli.score import score_command
+    from thegra_core.evaluation.scores import Settings
 
-    score_command(trajectory, groundtruth, images, shutter, tolerance, as_json)
+    settings = Settings(tolerance, max_gap, fit_lever_arm, fit_time_offset)
+    score_command(trajectory, groundtruth, images, shutter, settings, as_json)
 
 
 @app.command()

@@ -22,9 +22,9 @@ from thegra_core.config import load_config
 from thegra_core.errors import ConfigError, InputError
 from thegra_core.evaluation.benchmark.peers import best_peer, median_or_none
 from thegra_core.evaluation.scores import read_intervals, read_stamps
-from thegra_core.messages import FloatArray, IntArray
+from thegra_core.messages import FloatArray
 from thegra_core.outputs.files import write_atomic
-from thegra_core.outputs.scoring import half_period, score_trajectory
+from thegra_core.outputs.scoring import MIN_COVERAGE_PCT, score_trajectory, spread_of, within
 from thegra_core.outputs.trajectory import Trajectory, read_tum
 from thegra_core.sources.open import open_recording
 from thegra_core.version import VERSION
@@ -175,32 +175,19 @@ def _scores(run: PlannedRun, metrics: Mapping[str, Any]) -> dict[str, Any]:
     if not files["images"].is_file() or truth_file is None:
         truth = read_tum(truth_file) if truth_file is not None else None
         scored = {key: metrics.get(key) for key in ("ate_rmse", "ate_rel")}
-        return none | scored | ({"truth": _kind(truth), "spread": _spread(truth.positions)} if truth is not None else {})
+        return none | scored | ({"truth": _kind(truth), "spread": spread_of(truth.positions)} if truth is not None else {})
     stamps = read_stamps(files["images"])[: run.max_frames]
-    truth = _within(read_tum(truth_file), stamps)
+    truth = within(read_tum(truth_file), stamps)
     closures = read_intervals(files["shutter"]) if files["shutter"].is_file() else ()
     score = score_trajectory(read_tum(run.folder / "trajectory.txt"), truth, stamps, closures_ns=closures)
     return {key: getattr(score, key) for key in ("tracked_pct", "ate_rmse", "ate_rel", "ate_pct", "rot_deg", "in_closure")} | {
         "truth": _kind(truth),
-        "spread": _spread(truth.positions),
+        "spread": spread_of(truth.positions),
     }
-
-
-def _within(trajectory: Trajectory, stamps_ns: IntArray) -> Trajectory:
-    if len(stamps_ns) == 0:
-        return trajectory
-    margin = half_period(stamps_ns)
-    inside = (trajectory.stamps_ns >= stamps_ns[0] - margin) & (trajectory.stamps_ns <= stamps_ns[-1] + margin)
-    return Trajectory(trajectory.stamps_ns[inside], trajectory.poses[inside])
 
 
 def _kind(truth: Trajectory) -> str:
     return "moving" if len(truth) and _diagonal(truth.positions) > _STILL else "still"
-
-
-def _spread(positions: FloatArray) -> float:
-    """RMS distance of positions (N, 3) from their centroid: an aligned trajectory cannot have a larger ATE."""
-    return float(np.sqrt(np.mean(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1)))) if len(positions) else 0.0
 
 
 def _diagonal(positions: FloatArray) -> float:
@@ -213,6 +200,7 @@ def _diagonal(positions: FloatArray) -> float:
 def summarize(results: Sequence[RunResult]) -> dict[str, Any]:
     """Figures of the runs of one recording with one profile: medians and every seed's value; None of a seed stands for the worst.
 
+    A run that tracks less than `MIN_COVERAGE_PCT` has no error here; `runs` has what there is.
     Time is that of the first run that did not fail; memory the most of any.
     """
     first = results[0].run
@@ -220,8 +208,12 @@ def summarize(results: Sequence[RunResult]) -> dict[str, Any]:
     summary: dict[str, Any] = {"recording": first.name, "profile": first.profile, "max_frames": first.max_frames, "seeds": [r.run.seed for r in results]}
     summary["failed"] = [{"seed": r.run.seed, "exit_code": r.exit_code, "error": r.error} for r in results if r.error is not None]
     for key in ("tracked_pct", "ate_rmse", "ate_rel"):
-        values = [r.figures.get(key) for r in results]
-        summary[key] = {"median": median_or_none([f[key] for f in ran], worst=0.0 if key == "tracked_pct" else np.inf), "seeds": values}
+        told = [f[key] if key == "tracked_pct" or f["tracked_pct"] >= MIN_COVERAGE_PCT else None for f in ran]
+        values = iter(told)
+        summary[key] = {
+            "median": median_or_none(told, worst=0.0 if key == "tracked_pct" else np.inf),
+            "seeds": [next(values) if r.figures else None for r in results],
+        }
     for key in ("maps", "losses", "poses", "extent", "in_closure"):
         summary[key] = [r.figures.get(key) for r in results]
     summary |= {key: ran[0][key] if ran else None for key in ("truth", "spread", "s_per_frame", "cached_pct")}
