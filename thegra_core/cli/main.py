@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +15,22 @@ from thegra_core.cli.weights import app as weights_app
 from thegra_core.errors import ThegraError
 from thegra_core.process import keep_freed_memory
 from thegra_core.version import VERSION
+
+
+class Pieces(str, Enum):
+    """How recordings in several bag files are run."""
+
+    BAGS = "bags"
+    WHOLE = "whole"
+    WINDOWS = "windows"
+
+
+class ReferenceChoice(str, Enum):
+    """Which of several references to score against."""
+
+    AUTO = "auto"
+    LOAM = "loam"
+    VICON = "vicon"
 
 
 class _Group(TyperGroup):
@@ -131,6 +148,44 @@ def score(
 
     settings = Settings(tolerance, max_gap, fit_lever_arm, fit_time_offset)
     score_command(trajectory, groundtruth, images, shutter, settings, as_json)
+
+
+@app.command()
+def evaluate(
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Where the data set lies; `generic`: YAML lists of recordings.")],
+    dataset: Annotated[str, typer.Option(help="vivid, rovtio, tum, euroc, kitti or generic.")],
+    runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
+    profile: Annotated[list[str] | None, typer.Option(help="paper, quality or fast; repeatable. Default: quality.")] = None,
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time on this machine.")] = 1,
+    dask: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler, which must see the same files.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for tables and runs; with the folder of an evaluation, only what is missing is run. Default: runs/evaluate_DATASET.")] = None,
+    pieces: Annotated[Pieces, typer.Option(help="rovtio: one run a bag file, whole recordings, or windows of 30 s.")] = Pieces.BAGS,
+    reference: Annotated[ReferenceChoice, typer.Option(help="rovtio: loam or vicon; auto: LOAM where it is.")] = ReferenceChoice.AUTO,
+    camera: Annotated[str | None, typer.Option(metavar="FILE", help="Calibration for all sequences. Default: the data set's.")] = None,
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="This sequence; repeatable. Default: all.")] = None,
+    max_frames: Annotated[int | None, typer.Option(min=1, help="Use the first frames of each sequence only.")] = None,
+    fit_lever_arm: Annotated[bool, typer.Option("--fit-lever-arm", help="A second ATE with the camera's place on the reference's body fitted.")] = False,
+    fit_time_offset: Annotated[bool, typer.Option("--fit-time-offset", help="A second ATE with the reference's clock fitted, +-0.5 s.")] = False,
+    cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter for all runs; repeatable.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what is there, and what was decided about topics, cameras and references.")] = False,
+) -> None:
+    """Run a public data set and print the paper's table with its figures and ours.
+
+    Example: `thegra evaluate --dataset vivid /data/vivid --runs 3 --workers 2 --out runs/vivid`
+
+    Exit code: 0 all ran, 1 some run failed, 2 wrong use or nothing of the data set is there.
+    """
+    from thegra_core.cli.evaluate import EvaluateOptions
+    from thegra_core.cli.evaluate import evaluate as go
+    from thegra_core.evaluation.scores import Settings
+
+    options = EvaluateOptions(
+        dataset=dataset, folders=tuple(folders), out=out or Path("runs") / f"evaluate_{dataset}", runs=runs, profiles=tuple(dict.fromkeys(profile or ["quality"])), workers=workers,
+        dask=dask, pieces=pieces.value, reference=reference.value, camera=camera, only=tuple(only or ()), max_frames=max_frames, cache=cache, assignments=tuple(set_ or ()),
+        fits=Settings(fit_lever_arm=fit_lever_arm, fit_time_offset=fit_time_offset), dry_run=dry_run,
+    )  # fmt: skip
+    raise typer.Exit(go(options))
 
 
 @app.command()

@@ -80,6 +80,7 @@ def run_metrics(
         "bad_frames": bad,
         "tracked_pct": _percent(in_main, total),
         "tracked_any_pct": _percent(len(tracked), total),
+        "tracked_until_loss_pct": _percent(_until_loss(run), total),
         "maps": len(run.maps),
         "keyframes": sum(len(m.keyframe_stamps_ns) for m in run.maps),
         "landmarks": sum(len(m.points_world) for m in run.maps),
@@ -149,6 +150,14 @@ def is_bad(frame: FrameRecord, run: Run) -> bool:
 
 def _count(run: Run, states: tuple[TrackingState, ...]) -> int:
     return sum(f.world_from_camera is None and f.result.state in states and not is_bad(f, run) for f in run.frames)
+
+
+def _until_loss(run: Run) -> int:
+    """Frames with a pose before tracking was lost for the first time."""
+    states = [f.result.state for f in run.frames]
+    begin = next((i for i, state in enumerate(states) if state is TrackingState.TRACKING), 0)
+    end = next((i for i, state in enumerate(states) if i > begin and state in _LOST), len(states))
+    return sum(f.world_from_camera is not None for f in run.frames[:end])
 
 
 def _percent(part: int, whole: int) -> float:
