@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from thegra_core.cli import evaluate as evaluate_command
 from thegra_core.cli.main import app
 from thegra_core.errors import ConfigError
-from thegra_core.evaluation import tables
+from thegra_core.evaluation import tables, workers
 from thegra_core.evaluation.datasets.rovtio import LOAM
 from thegra_core.evaluation.datasets.sequence import DataSequence, Found
 from thegra_core.evaluation.evaluate import Plan, Result, failed, figures_of, plan_jobs, run_jobs
@@ -286,7 +286,8 @@ def test_workers_share_the_cores(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")  # of a client that cannot connect
-def test_a_scheduler_that_does_not_answer_is_told(tmp_path: Path) -> None:
+def test_a_scheduler_that_does_not_answer_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "CONNECT_S", 0.3)
     with pytest.raises(ConfigError, match="no scheduler answers"):
         run_tasks([RunTask("a", tmp_path, tmp_path)], lambda *_: None, dask="tcp://127.0.0.1:9", runner=pretend)
 

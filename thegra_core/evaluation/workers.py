@@ -11,6 +11,8 @@ from typing import Any
 from thegra_core.errors import ConfigError
 from thegra_core.evaluation.tasks import Outcome, RunTask, execute
 
+CONNECT_S = 10.0
+"""How long a scheduler may take to answer."""
 Runner = Callable[[RunTask], Outcome]
 Told = Callable[[int, Outcome], None]
 
@@ -47,10 +49,10 @@ def _on_dask(tasks: Sequence[RunTask], told: Told, address: str, runner: Runner)
     except ImportError as error:
         raise ConfigError("--dask needs the package distributed; type: pip install -e .[dask]") from error
     try:
-        client = Client(address, timeout="10s", set_as_default=False)
+        client = Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise ConfigError(f"--dask {address}: no scheduler answers there ({error}); start one with `dask scheduler` and workers with `dask worker {address}`") from error
-    with client:
+    with client, client.as_current():
         # two equal calls are two runs: pure would merge them; retries are the user's to decide
         places = {client.submit(runner, task, pure=False, retries=0, key=f"thegra-{os.getpid()}-{i}"): i for i, task in enumerate(tasks)}
         return _collect(dask_completed(places), places, told)
