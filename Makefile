@@ -48,7 +48,7 @@ clean: ## remove what make made (the weights' cache stays)
 
 $(DEMO_BAG)/metadata.yaml: | $(VENV)/.installed
 	rm -rf $(DEMO_BAG)
-	$(BIN)/python -m thegra_core.simulation.demo $(DEMO_BAG)
+	$(BIN)/thegra simulate --scene room --duration 20 --rate 10 --size 320x256 --shutter freeze --out $(DEMO_BAG)
 
 $(VENV)/.python:
 	@tools/find_python.sh "$(PYTHON)" > /dev/null

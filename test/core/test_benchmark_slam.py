@@ -16,11 +16,13 @@ from thegra_core.evaluation.benchmark.slam import Plan, PlannedRun, RunResult, f
 from thegra_core.evaluation.benchmark.tables import failures, markdown, table
 from thegra_core.evaluation.scores import score_files
 from thegra_core.outputs.trajectory import format_stamp, format_tum, make_trajectory
-from thegra_core.simulation.demo import make_demo_bag
+from thegra_core.simulation.sensor_config import SensorConfig
+from thegra_core.simulation.simulate import SimulationOptions, simulate
 from thegra_core.sources.open import open_recording
 
 SECOND = 1_000_000_000
 FRAMES = 12
+EASY = SimulationOptions(duration_s=FRAMES / 5, rate_hz=5, image_size=(320, 256), seed=1, sensor=SensorConfig(netd_mk=20))
 FAST_ENOUGH = ("--set", "extractor.name=orb", "--set", "preprocessing.filters=[{filter: he_clip}]")
 
 
@@ -86,7 +88,7 @@ def failed(seed: int) -> RunResult:
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of images with camera, ground truth, and a closure that no frame is in the middle of."""
     base = tmp_path_factory.mktemp("recordings")
-    bag, folder = make_demo_bag(base / "bag", duration_s=FRAMES / 10), base / "walk"
+    bag, folder = simulate(EASY, base / "bag"), base / "walk"
     folder.mkdir()
     lines = []
     for frame in open_recording(bag).frames():
@@ -225,7 +227,7 @@ def test_without_motion_to_compare_with_the_claims_are_told(tmp_path: Path, stil
 
 
 def test_a_bag_is_scored_as_the_run_scored_itself(tmp_path: Path) -> None:
-    bag = make_demo_bag(tmp_path / "bag", duration_s=0.2, image_size=(32, 24))
+    bag = simulate(SimulationOptions(duration_s=0.2, image_size=(32, 24)), tmp_path / "bag")
     figures = figures_of(planned(bag, run_folder(tmp_path / "out", "", ate_rmse=0.25, ate_rel=0.5)))
     assert (figures["tracked_pct"], figures["ate_rmse"], figures["ate_rel"], figures["truth"]) == (12.5, 0.25, 0.5, "moving")
 

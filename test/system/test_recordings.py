@@ -14,7 +14,7 @@ from thegra_core.errors import WeightsError
 from thegra_core.evaluation.benchmark.slam import Plan, execute, planned_runs
 from thegra_core.features.registry import weights_for
 from thegra_core.features.weights import path_of
-from thegra_core.simulation.demo import make_demo_bag
+from thegra_core.simulation.simulate import SimulationOptions, simulate
 
 MAX_MEMORY_MB = 2500
 PATIENCE_S = 3600
@@ -117,7 +117,7 @@ def test_a_hovering_camera_that_pans_claims_no_journey(shared_data: Path, tmp_pa
 
 
 def test_same_input_same_bytes(tmp_path: Path) -> None:
-    bag = make_demo_bag(tmp_path / "bag", duration_s=0.8, image_size=(256, 192))
+    bag = simulate(SimulationOptions(duration_s=0.8, image_size=(256, 192)), tmp_path / "bag")
     extractor = "orb" if missing_weights("fast") else "xfeat"
     outs = [tmp_path / "first", tmp_path / "second"]
     for out in outs:

@@ -116,15 +116,12 @@ def preprocessing(
 def _frames_of(recordings: Sequence[Path], count: int) -> list[ImageArray]:
     import numpy as np
 
-    from thegra_core.simulation.demo import thermal_camera
-    from thegra_core.simulation.paths import PATHS
-    from thegra_core.simulation.renderer import pixel_rays, render
-    from thegra_core.simulation.scene import SCENES
+    from thegra_core.simulation.simulate import SimulationOptions, rendered
     from thegra_core.sources.open import open_recording
 
     if not recordings:
-        rays, rng = pixel_rays(thermal_camera((640, 512))), np.random.default_rng(0)
-        return [render(SCENES["room"](0), rays, PATHS["room"].world_from_camera(float(i)), 3.0, rng).image for i in range(count)]
+        ticks = rendered(SimulationOptions(duration_s=float(count), rate_hz=1.0)).ticks
+        return [tick.image for tick in ticks if tick.image is not None]
     chosen: list[ImageArray] = []
     for path in recordings:
         recording = open_recording(path)

@@ -238,6 +238,31 @@ def study(
     run_study(plan_study(recordings, interval, pairs, chain, front_end, cache, folder))
 
 
+@app.command()
+def simulate(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="New folder for the recording.")],
+    scene: Annotated[str | None, typer.Option(help="room, corridor, street or tunnel. Default: room.")] = None,
+    style: Annotated[str | None, typer.Option(help="How the camera is carried: robust, unstable or aggressive. Default: robust.")] = None,
+    duration: Annotated[float | None, typer.Option(metavar="S", help="Seconds. Default: once round the scene and a little more.")] = None,
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Frames a second. Default: 10.")] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Image size. Default: 640x512.")] = None,
+    shutter: Annotated[str | None, typer.Option(help="none, gap (no frames while it is closed) or freeze (the last frame again). Default: none.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of scene, path and sensor. Default: 0.")] = None,
+    source: Annotated[Path | None, typer.Option("--from", metavar="FOLDER", help="A recording whose images pass through the simulated sensor in place of a scene.")] = None,
+    format_: Annotated[str, typer.Option("--format", help="mcap, folder, vivid or rovtio (ROS 1 bags as in those sets).")] = "mcap",
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter of the sensor, e.g. netd_mk=40; repeatable. docs/simulator.md lists them.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bar.")] = False,
+) -> None:
+    """Make a simulated thermal recording with exact ground truth.
+
+    Example: `thegra simulate --scene corridor --style unstable --shutter gap --out bags/corridor`
+    """
+    from thegra_core.cli.simulate import simulate_command
+
+    values = {"scene": scene, "style": style, "duration_s": duration, "rate_hz": rate, "shutter": shutter, "seed": seed, "source": source}
+    simulate_command(values, size, set_ or (), format_, out, quiet)
+
+
 app.add_typer(weights_app, name="weights")
 app.add_typer(benchmark_app, name="benchmark")
 
