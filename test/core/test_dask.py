@@ -83,9 +83,9 @@ def test_a_worker_that_is_killed_costs_its_task_only(scheduler: str, tmp_path: P
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_real_run_on_a_worker_is_the_run_that_is_made_here(scheduler: str, tmp_path: Path) -> None:
-    from thegra_core.simulation.demo import make_demo_bag
+    from thegra_core.simulation.simulate import SimulationOptions, simulate
 
-    bag = make_demo_bag(tmp_path / "bag", duration_s=1.2, image_size=(256, 192))
+    bag = simulate(SimulationOptions(duration_s=2.4, rate_hz=5, image_size=(320, 256), seed=1, sensor={"netd_mk": 20}), tmp_path / "bag")
     options = ("--set", "extractor.name=orb", "--set", "preprocessing.filters=[{filter: he_clip}]")
     there, here = (RunTask("demo", bag, tmp_path / name, options, bag / "groundtruth.txt") for name in ("there", "here"))
     (outcome,) = run_tasks([there], lambda *_: None, dask=scheduler)
