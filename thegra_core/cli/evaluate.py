@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ from thegra_core.outputs.files import write_atomic
 from thegra_core.version import VERSION
 
 SOME_FAILED = 1
-NOTHING_RUN = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ def evaluate(options: EvaluateOptions) -> int:
     Raises:
         ThegraError: If an option cannot be used or nothing of the data set is there.
     """
-    options = _absolute(options)
+    options = absolute(options)
     found = find(options)
     plan = Plan(options.dataset, found, options.out, options.profiles, options.runs, options.assignments, options.cache, options.max_frames, options.fits)
     _say_missing(found)
@@ -92,7 +92,7 @@ def find(options: EvaluateOptions) -> Found:
     return Found(chosen, tuple(m for m in found.missing if m.name in options.only))
 
 
-def _absolute(options: EvaluateOptions) -> EvaluateOptions:
+def absolute(options: EvaluateOptions) -> EvaluateOptions:
     """Paths that mean the same wherever a worker runs."""
     camera = options.camera
     if camera is not None:
@@ -140,6 +140,13 @@ def _rows(plan: Plan, lines: Sequence[tables.Line], options: EvaluateOptions) ->
 
 
 def _run(jobs: Sequence[Job], plan: Plan, options: EvaluateOptions) -> list[Result]:
+    with progress_of(jobs) as told:
+        return run_jobs(jobs, plan, told, options.workers, options.dask)
+
+
+@contextmanager
+def progress_of(jobs: Sequence[Job]) -> Iterator[Callable[[int, Outcome], None]]:
+    """A bar on stderr, and above it a line for each job that is done; yields what tells it."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -153,7 +160,7 @@ def _run(jobs: Sequence[Job], plan: Plan, options: EvaluateOptions) -> list[Resu
             console.print(f"{jobs[place].task.name}: {state}", markup=False, soft_wrap=True)
             bar.advance(task)
 
-        return run_jobs(jobs, plan, told, options.workers, options.dask)
+        yield told
 
 
 def _say_missing(found: Found) -> None:

@@ -33,6 +33,13 @@ class ReferenceChoice(str, Enum):
     VICON = "vicon"
 
 
+class Choice(str, Enum):
+    """What an ablation compares."""
+
+    WEIGHTING = "weighting"
+    CHAIN = "chain"
+
+
 class _Group(TyperGroup):
     """Shows errors that the user can do something about as one message instead of a traceback."""
 
@@ -184,6 +191,37 @@ def evaluate(
         dataset=dataset, folders=tuple(folders), out=out or Path("runs") / f"evaluate_{dataset}", runs=runs, profiles=tuple(dict.fromkeys(profile or ["quality"])), workers=workers,
         dask=dask, pieces=pieces.value, reference=reference.value, camera=camera, only=tuple(only or ()), max_frames=max_frames, cache=cache, assignments=tuple(set_ or ()),
         fits=Settings(fit_lever_arm=fit_lever_arm, fit_time_offset=fit_time_offset), dry_run=dry_run,
+    )  # fmt: skip
+    raise typer.Exit(go(options))
+
+
+@app.command()
+def ablation(
+    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Recordings as `thegra run` takes them, with groundtruth.txt beside; with --dataset its folders.")],
+    dataset: Annotated[str | None, typer.Option(help="Take the sequences of this data set, as `thegra evaluate` does.")] = None,
+    choice: Annotated[list[Choice] | None, typer.Option(help="weighting or chain; repeatable. Default: both.")] = None,
+    profile: Annotated[str, typer.Option(help="paper, quality or fast: what the choices are made in.")] = "quality",
+    runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time on this machine.")] = 1,
+    dask: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler, which must see the same files.")] = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for tables, pictures and runs; what is there already is not run again.")] = Path("runs/ablation"),
+    camera: Annotated[str | None, typer.Option(metavar="FILE", help="Calibration for all. Default: the recording's own.")] = None,
+    cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Where the networks' results are kept. Default: cache in the folder for the results.")] = None,
+    max_frames: Annotated[int | None, typer.Option(min=1, help="Use the first frames of each recording only.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter for all runs; repeatable.")] = None,
+) -> None:
+    """Compare the weights of the observations (the paper's Table III) and the filters by coverage and error.
+
+    Example: `thegra ablation recordings/* --runs 3 --workers 2 --out runs/ablation`
+
+    Writes ablation.md, ablation.csv, weighting.png and chain.png. Exit code: 0 all ran, 1 some run failed, 2 wrong use.
+    """
+    from thegra_core.cli.ablation import AblationOptions
+    from thegra_core.cli.ablation import ablation as go
+
+    options = AblationOptions(
+        inputs=tuple(inputs), out=out, dataset=dataset, groups=tuple(c.value for c in dict.fromkeys(choice or Choice)), profile=profile, runs=runs, workers=workers, dask=dask,
+        camera=camera, cache=cache, max_frames=max_frames, assignments=tuple(set_ or ()),
     )  # fmt: skip
     raise typer.Exit(go(options))
 
