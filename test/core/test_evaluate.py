@@ -292,3 +292,20 @@ def test_a_scheduler_that_does_not_answer_is_told(tmp_path: Path, monkeypatch: p
         run_tasks([RunTask("a", tmp_path, tmp_path)], lambda *_: None, dask="tcp://127.0.0.1:9", runner=pretend)
 
 
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("dataset", "row", "told"), [("vivid", "dark_robust", "Vicon table indoor_robust_dark_gt.csv"), ("rovtio", "alt1", "reference LOAM")])
+def test_a_simulated_recording_in_the_sets_layout_goes_all_the_way(tmp_path: Path, dataset: str, row: str, told: str) -> None:
+    from thegra_core.simulation.simulate import SimulationOptions, simulate
+
+    options = SimulationOptions(duration_s=2.4, rate_hz=5, image_size=(320, 256), seed=1, sensor={"netd_mk": 20})
+    simulate(options, tmp_path / "data" / "alt1", dataset)
+    arguments = ["evaluate", "--dataset", dataset, tmp_path / "data", "--out", tmp_path / "out", "--set", "extractor.name=orb", "--set", "preprocessing.filters=[{filter: he_clip}]"]
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    assert done.exit_code == 0, done.output
+    content = json.loads((tmp_path / "out" / "results.json").read_text())
+    (run,) = content["results"]
+    assert run["sequence"] == row
+    assert run["tracked_pct"] > 80 and run["ate_rmse"] < 0.2 and run["ate_pairs"] >= 9
+    assert told in "; ".join(next(iter(content["notes"].values())))

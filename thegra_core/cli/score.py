@@ -58,7 +58,7 @@ def score_rows(figures: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("ATE RMSE", f"needs 3 frames with pose and ground truth, there are {figures['pairs']}"))
         rows += _formatted(_ERRORS[-1:], figures)
     elif not figures["covered"]:
-        rows.append(("ATE RMSE", f"- (not told: fewer than {MIN_COVERAGE_PCT:g} % of the frames have a pose)"))
+        rows.append(("ATE RMSE", f"- (not told: fewer than {MIN_COVERAGE_PCT:g} % of the frames have a pose; without --images FILE the frames are the ground truth's)"))
         rows += _formatted(_ERRORS[-1:], figures)
     else:
         rows += _formatted(_ERRORS[:1], figures)

@@ -17,6 +17,7 @@ from thegra_core.evaluation.datasets.bag_poses import pose_topics, read_bag_pose
 from thegra_core.evaluation.datasets.sequence import DataSequence, Found, Missing, Options, Reference
 from thegra_core.evaluation.datasets.staging import camera_preset, linked_bags
 from thegra_core.evaluation.datasets.thermal_topic import thermal_topic
+from thegra_core.sources.calibration import BESIDE
 from thegra_core.sources.folder import natural_key
 
 SEQUENCES = ("alt1", "alt2", "sync", "lt1", "lt2", "lt3")
@@ -72,7 +73,8 @@ def _bags(folders: Sequence[Path], name: str) -> list[Path]:
 
 def _pieces(name: str, bags: list[Path], options: Options) -> list[DataSequence]:
     topic, told = thermal_topic(bags[0], TOPICS, SIZE)
-    camera = options.camera or camera_preset("rovtio_tau2")
+    own = next((str(file) for file in (bags[0].parent / calibration for calibration in BESIDE) if file.is_file()), None)
+    camera = options.camera or own or camera_preset("rovtio_tau2")
     reference, which = _reference(bags, options)
     notes = (told, which, f"camera {camera}")
     if options.pieces == "bags":
