@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -65,7 +65,6 @@ class Options:
     window_s: float = 30.0
     reference: ReferenceChoice = "auto"
     camera: str | None = None
-    only: tuple[str, ...] = field(default=())
 
 
 class DataSet(Protocol):
