@@ -32,12 +32,14 @@ REQUIRES = [
     "matplotlib>=3.8",
     "torch>=2.4",
 ]
+DASK = ["distributed>=2024.1"]
 SIM = ["trimesh>=4.4", "embreex>=2.17.7"]
 TEST = ["pytest>=8", "pytest-timeout>=2.2", "hypothesis>=6.100", "evo>=1.28", "pytransform3d>=3.5", *SIM]
 EXTRAS = {
     "sim": SIM,
     "test": TEST,
-    "dev": [*TEST, "ruff>=0.5", "mypy>=1.10", "types-PyYAML", "import-linter>=2.1"],
+    "dev": [*TEST, *DASK, "ruff>=0.5", "mypy>=1.10", "types-PyYAML", "import-linter>=2.1"],
+    "dask": DASK,
     "viz": ["rerun-sdk>=0.23"],
     "ros": [
         "ros-jazzy-rclpy",

@@ -72,7 +72,8 @@ def planned(recording: Path, folder: Path, seed: int = 0, max_frames: int | None
 def result(seed: int, **figures: object) -> RunResult:
     base = {
         "truth": "moving", "tracked_pct": 100.0, "ate_rmse": 0.1, "ate_rel": 0.01, "maps": 1, "losses": 0, "poses": 10, "extent": 2.0, "in_closure": 0,
-        "spread": 10.0, "s_per_frame": {"p50": 0.25, "p95": 1.5}, "cached_pct": None, "peak_rss_mb": 300.0,
+        "spread": 10.0, "s_per_frame": {"p50": 0.25, "p95": 1.5}, "cached_pct": None, "peak_rss_mb": 300.0, "ate_pct": 0.5, "ate_live_rmse": 0.2,
+        "recall_1pct": 90.0, "fps": 4.0, "ms_stages": {"features": 120.4, "matching": 60.0, "preprocessing": 0.2, "total": 250.0},
     }  # fmt: skip
     return RunResult(PlannedRun(Path("/r/yard"), "fast", seed, Path("/out"), None), 0, base | figures)
 
@@ -253,6 +254,19 @@ def test_a_summary_has_every_seed() -> None:
     content = report(Plan((Path("/r/yard"),), Path("/out"), runs=4), runs)
     assert failures(content) == ["yard, fast, seed 1 (exit code 2): thegra: no camera"]
     assert table(content)[1][0][2:5] == ["100.0 (100.0, –, 100.0, 100.0)", "0.3 (0.3, –, 0.1, –)", "1 %"]
+
+
+def test_a_row_tells_speed_live_error_and_recall() -> None:
+    header, rows = table(report(Plan((Path("/r/yard"),), Path("/out")), [result(0)]))
+    row = dict(zip(header, rows[0], strict=True))
+    assert (row["of path"], row["live ATE"], row["recall %"], row["fps"], row["ms a stage"]) == ("0.5 %", "0.2", "90.0", "4", "features 120, matching 60")
+
+
+def test_no_error_is_told_of_a_run_that_tracks_less_than_half() -> None:
+    summary = summarize([result(0, tracked_pct=49.0), result(1, tracked_pct=50.0, ate_rmse=0.2)])
+    assert summary["ate_rmse"] == {"median": None, "seeds": [None, 0.2]}
+    assert summary["recall_1pct"]["seeds"] == [90.0, 90.0]
+    assert summary["runs"][0]["ate_rmse"] == 0.1
 
 
 def test_a_recording_whose_runs_all_failed_has_a_row() -> None:

@@ -24,7 +24,7 @@ from thegra_core.errors import InputError
 from thegra_core.messages import Run, TrackingResult, TrackingState
 from thegra_core.outputs.trajectory import format_tum, make_trajectory, read_tum
 
-COMMANDS = ["run", "info", "score", "config", "doctor", "benchmark slam", "weights list", "weights fetch", "weights verify"]
+COMMANDS = ["run", "info", "score", "evaluate", "ablation", "config", "doctor", "benchmark slam", "weights list", "weights fetch", "weights verify"]
 
 
 def invoke(*arguments: str | Path):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from thegra_core.config import PROFILES
 from thegra_core.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -27,8 +28,11 @@ def benchmark() -> None:
 
 @app.command("slam")
 def slam(
-    recordings: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Recordings as `thegra run` takes them, with groundtruth.txt and shutter.txt beside the images if there are.")],
-    profile: Annotated[list[str] | None, typer.Option(help="paper, quality or fast; repeatable. Default: quality.")] = None,
+    recordings: Annotated[list[Path] | None, typer.Argument(metavar="[DIR...]", help="Recordings as `thegra run` takes them, with groundtruth.txt and shutter.txt beside the images if there are.")] = None,
+    suite: Annotated[bool, typer.Option("--suite", help="Also the fixed simulated suite; what is missing of it is made first.")] = False,
+    suite_dir: Annotated[Path, typer.Option(metavar="DIR", help="Where the suite is kept.")] = Path("runs/suite"),
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Of the suite only this sequence; repeatable.")] = None,
+    profile: Annotated[list[str] | None, typer.Option(help="paper, quality or fast; repeatable. Default: quality; with --suite all.")] = None,
     runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
     cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there; their time is then missing from s/frame.")] = None,
     max_frames: Annotated[list[str] | None, typer.Option("--max-frames", metavar="NAME=N", help="Use the first N frames of the recording of that name; repeatable.")] = None,
@@ -39,7 +43,7 @@ def slam(
 ) -> None:
     """Run recordings with profiles and seeds, each in a process of its own, and tell coverage, error, time and memory.
 
-    Example: `thegra benchmark slam recordings/* --profile quality --profile fast --runs 3 --out runs/benchmark`
+    Example: `thegra benchmark slam recordings/* --profile quality --profile fast --runs 3 --out runs/benchmark`, or `thegra benchmark slam --suite`
 
     Writes results.json and results.md (a table for a README). Exit code: 0 all ran, 1 some run failed, 2 wrong use.
     """
@@ -50,10 +54,13 @@ def slam(
     from thegra_core.evaluation.benchmark.peers import read_peers
     from thegra_core.evaluation.benchmark.tables import markdown
 
+    if not recordings and not suite:
+        raise InputError("nothing to run: name recordings, or add --suite for the simulated ones")
+    made = _suite(suite_dir, only) if suite else []
     plan = logic.Plan(
-        recordings=tuple(recordings),
+        recordings=(*(recordings or ()), *made),
         out=out or Path("runs") / f"benchmark_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}",
-        profiles=tuple(dict.fromkeys(profile or ["quality"])),
+        profiles=tuple(dict.fromkeys(profile or (PROFILES if suite else ["quality"]))),
         runs=runs,
         cache=cache,
         max_frames=_limits(max_frames or []),
@@ -131,6 +138,19 @@ def _frames_of(recordings: Sequence[Path], count: int) -> list[ImageArray]:
     if not chosen:
         raise InputError("the recordings hold no readable image; what they hold is told by: thegra info INPUT")
     return chosen
+
+
+def _suite(folder: Path, names: Sequence[str] | None) -> list[Path]:
+    """The simulated recordings, made with a bar where they are missing."""
+    from rich.console import Console
+
+    from thegra_core.evaluation.suite import SUITE, make_suite
+
+    unknown = next((name for name in names or () if name not in SUITE), None)
+    if unknown is not None:
+        raise ConfigError(f"--only {unknown}: the suite has no such sequence; it has {', '.join(SUITE)}")
+    with Console(stderr=True).status("looking for the suite") as status:
+        return make_suite(folder, names or None, lambda name, done, total: status.update(f"simulating {name}: {done} of {total} frames"))
 
 
 def _limits(texts: list[str]) -> dict[str, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +15,29 @@ from thegra_core.cli.weights import app as weights_app
 from thegra_core.errors import ThegraError
 from thegra_core.process import keep_freed_memory
 from thegra_core.version import VERSION
+
+
+class Pieces(str, Enum):
+    """How recordings in several bag files are run."""
+
+    BAGS = "bags"
+    WHOLE = "whole"
+    WINDOWS = "windows"
+
+
+class ReferenceChoice(str, Enum):
+    """Which of several references to score against."""
+
+    AUTO = "auto"
+    LOAM = "loam"
+    VICON = "vicon"
+
+
+class Choice(str, Enum):
+    """What an ablation compares."""
+
+    WEIGHTING = "weighting"
+    CHAIN = "chain"
 
 
 class _Group(TyperGroup):
@@ -121,6 +145,9 @@ def score(
     images: Annotated[Path | None, typer.Option(metavar="FILE", help="List with a stamp first on each line: the frames that count. Default: the ground truth's.")] = None,
     shutter: Annotated[Path | None, typer.Option(metavar="FILE", help="`begin end` of each shutter closure; frames inside are not scored.")] = None,
     tolerance: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="Farthest stamp that belongs to a frame. Default: half a frame period.")] = None,
+    max_gap: Annotated[float, typer.Option(metavar="S", min=0.0, help="The ground truth is interpolated in gaps up to this; 0: only its nearest pose, as evo does.")] = 0.5,
+    fit_lever_arm: Annotated[bool, typer.Option("--fit-lever-arm", help="Fit the camera's place on the body that the ground truth tells of.")] = False,
+    fit_time_offset: Annotated[bool, typer.Option("--fit-time-offset", help="Fit the offset of the ground truth's clock, +-0.5 s, by the rotation rates.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Score a trajectory against ground truth: coverage, ATE and RPE after Sim(3) alignment.
@@ -128,8 +155,79 @@ def score(
     Example: `thegra score runs/flight/trajectory.txt groundtruth.txt --images images.txt`
     """
     from thegra_core.cli.score import score_command
+    from thegra_core.evaluation.scores import Settings
 
-    score_command(trajectory, groundtruth, images, shutter, tolerance, as_json)
+    settings = Settings(tolerance, max_gap, fit_lever_arm, fit_time_offset)
+    score_command(trajectory, groundtruth, images, shutter, settings, as_json)
+
+
+@app.command()
+def evaluate(
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Where the data set lies; `generic`: YAML lists of recordings.")],
+    dataset: Annotated[str, typer.Option(help="vivid, rovtio, tum, euroc, kitti or generic.")],
+    runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
+    profile: Annotated[list[str] | None, typer.Option(help="paper, quality or fast; repeatable. Default: quality.")] = None,
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time on this machine.")] = 1,
+    dask: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler, which must see the same files.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for tables and runs; with the folder of an evaluation, only what is missing is run. Default: runs/evaluate_DATASET.")] = None,
+    pieces: Annotated[Pieces, typer.Option(help="rovtio: one run a bag file, whole recordings, or windows of 30 s.")] = Pieces.BAGS,
+    reference: Annotated[ReferenceChoice, typer.Option(help="rovtio: loam or vicon; auto: LOAM where it is.")] = ReferenceChoice.AUTO,
+    camera: Annotated[str | None, typer.Option(metavar="FILE", help="Calibration for all sequences. Default: the data set's.")] = None,
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="This sequence; repeatable. Default: all.")] = None,
+    max_frames: Annotated[int | None, typer.Option(min=1, help="Use the first frames of each sequence only.")] = None,
+    fit_lever_arm: Annotated[bool, typer.Option("--fit-lever-arm", help="A second ATE with the camera's place on the reference's body fitted.")] = False,
+    fit_time_offset: Annotated[bool, typer.Option("--fit-time-offset", help="A second ATE with the reference's clock fitted, +-0.5 s.")] = False,
+    cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter for all runs; repeatable.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what is there, and what was decided about topics, cameras and references.")] = False,
+) -> None:
+    """Run a public data set and print the paper's table with its figures and ours.
+
+    Example: `thegra evaluate --dataset vivid /data/vivid --runs 3 --workers 2 --out runs/vivid`
+
+    Exit code: 0 all ran, 1 some run failed, 2 wrong use or nothing of the data set is there.
+    """
+    from thegra_core.cli.evaluate import EvaluateOptions
+    from thegra_core.cli.evaluate import evaluate as go
+    from thegra_core.evaluation.scores import Settings
+
+    options = EvaluateOptions(
+        dataset=dataset, folders=tuple(folders), out=out or Path("runs") / f"evaluate_{dataset}", runs=runs, profiles=tuple(dict.fromkeys(profile or ["quality"])), workers=workers,
+        dask=dask, pieces=pieces.value, reference=reference.value, camera=camera, only=tuple(only or ()), max_frames=max_frames, cache=cache, assignments=tuple(set_ or ()),
+        fits=Settings(fit_lever_arm=fit_lever_arm, fit_time_offset=fit_time_offset), dry_run=dry_run,
+    )  # fmt: skip
+    raise typer.Exit(go(options))
+
+
+@app.command()
+def ablation(
+    inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Recordings as `thegra run` takes them, with groundtruth.txt beside; with --dataset its folders.")],
+    dataset: Annotated[str | None, typer.Option(help="Take the sequences of this data set, as `thegra evaluate` does.")] = None,
+    choice: Annotated[list[Choice] | None, typer.Option(help="weighting or chain; repeatable. Default: both.")] = None,
+    profile: Annotated[str, typer.Option(help="paper, quality or fast: what the choices are made in.")] = "quality",
+    runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time on this machine.")] = 1,
+    dask: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler, which must see the same files.")] = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for tables, pictures and runs; what is there already is not run again.")] = Path("runs/ablation"),
+    camera: Annotated[str | None, typer.Option(metavar="FILE", help="Calibration for all. Default: the recording's own.")] = None,
+    cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Where the networks' results are kept. Default: cache in the folder for the results.")] = None,
+    max_frames: Annotated[int | None, typer.Option(min=1, help="Use the first frames of each recording only.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter for all runs; repeatable.")] = None,
+) -> None:
+    """Compare the weights of the observations (the paper's Table III) and the filters by coverage and error.
+
+    Example: `thegra ablation recordings/* --runs 3 --workers 2 --out runs/ablation`
+
+    Writes ablation.md, ablation.csv, weighting.png and chain.png. Exit code: 0 all ran, 1 some run failed, 2 wrong use.
+    """
+    from thegra_core.cli.ablation import AblationOptions
+    from thegra_core.cli.ablation import ablation as go
+
+    options = AblationOptions(
+        inputs=tuple(inputs), out=out, dataset=dataset, groups=tuple(c.value for c in dict.fromkeys(choice or Choice)), profile=profile, runs=runs, workers=workers, dask=dask,
+        camera=camera, cache=cache, max_frames=max_frames, assignments=tuple(set_ or ()),
+    )  # fmt: skip
+    raise typer.Exit(go(options))
 
 
 @app.command()

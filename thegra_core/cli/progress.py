@@ -15,6 +15,7 @@ from rich.progress import Progress as RichProgress
 from rich.table import Table
 
 from thegra_core.messages import TrackingResult, TrackingState
+from thegra_core.outputs.scoring import MIN_COVERAGE_PCT
 from thegra_core.outputs.viewer import Scene
 from thegra_core.outputs.write import WrittenRun
 
@@ -124,7 +125,8 @@ def make_progress(quiet: bool, total: int | None) -> Progress:
 
 def headline(metrics: dict[str, Any]) -> str:
     """The run in one line."""
-    ate = f", ATE {metrics['ate_rmse']:.4g}" if metrics.get("ate_rmse") is not None else ""
+    told = metrics.get("ate_rmse") is not None and metrics["tracked_pct"] >= MIN_COVERAGE_PCT
+    ate = f", ATE {metrics['ate_rmse']:.4g}" if told else ""
     return f"{metrics['frames_tracked']} of {metrics['frames_total']} frames tracked ({metrics['tracked_pct']:g} %){ate}"
 
 
@@ -172,6 +174,8 @@ def _error(metrics: dict[str, Any]) -> str:
         return "no ground truth"
     if metrics["ate_rmse"] is None:
         return "fewer than 3 frames with pose and ground truth"
+    if metrics["tracked_pct"] < MIN_COVERAGE_PCT:
+        return f"- (fewer than {MIN_COVERAGE_PCT:g} % of the frames have a pose)"
     live = f"; as estimated at the time {metrics['ate_live_rmse']:.4g}" if metrics["ate_live_rmse"] is not None else ""
     return f"{metrics['ate_rmse']:.4g} over {metrics['ate_pairs']} frames of a path of {metrics['path_length']:.4g}{live}"
 

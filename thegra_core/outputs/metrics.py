@@ -13,7 +13,7 @@ import numpy as np
 
 from thegra_core.config import ThegraConfig
 from thegra_core.messages import FrameRecord, Run, TrackingState
-from thegra_core.outputs.scoring import Score, half_period, score_trajectory
+from thegra_core.outputs.scoring import Score, path_length, score_trajectory, within
 from thegra_core.outputs.trajectory import NS_PER_S, Trajectory, final_trajectory, live_trajectory
 from thegra_core.version import VERSION
 
@@ -50,9 +50,10 @@ class RunScores:
 def score_run(run: Run, groundtruth: Trajectory) -> RunScores:
     """Score the main map against the part of the ground truth that the frames span."""
     stamps = np.unique(np.array([f.stamp_ns for f in run.frames], np.int64))
-    truth = _within(groundtruth, stamps)
-    final = score_trajectory(final_trajectory(run, run.main_map_id), truth, stamps)
-    live = score_trajectory(live_trajectory(run, run.main_map_id), truth, stamps)
+    truth = within(groundtruth, stamps)
+    final, live = (
+        score_trajectory(make(run, run.main_map_id), groundtruth, stamps, path=path_length(truth.positions)) for make in (final_trajectory, live_trajectory)
+    )
     return RunScores(final, live, truth)
 
 
@@ -79,6 +80,7 @@ def run_metrics(
         "bad_frames": bad,
         "tracked_pct": _percent(in_main, total),
         "tracked_any_pct": _percent(len(tracked), total),
+        "tracked_until_loss_pct": _percent(_until_loss(run), total),
         "maps": len(run.maps),
         "keyframes": sum(len(m.keyframe_stamps_ns) for m in run.maps),
         "landmarks": sum(len(m.points_world) for m in run.maps),
@@ -112,6 +114,10 @@ def _score_metrics(scores: RunScores) -> dict[str, Any]:
         "ate_pct": final.ate_pct,
         "ate_rel": final.ate_rel,
         "ate_pairs": final.pairs,
+        "ate_pairs_pct": final.pairs_pct,
+        "ate_time_pct": final.time_pct,
+        "ate_path": final.path_scored,
+        "ate_spread": final.spread,
         "ate_median": final.ate_median,
         "ate_max": final.ate_max,
         "rot_deg": final.rot_deg,
@@ -146,13 +152,13 @@ def _count(run: Run, states: tuple[TrackingState, ...]) -> int:
     return sum(f.world_from_camera is None and f.result.state in states and not is_bad(f, run) for f in run.frames)
 
 
+def _until_loss(run: Run) -> int:
+    """Frames with a pose before tracking was lost for the first time."""
+    states = [f.result.state for f in run.frames]
+    begin = next((i for i, state in enumerate(states) if state is TrackingState.TRACKING), 0)
+    end = next((i for i, state in enumerate(states) if i > begin and state in _LOST), len(states))
+    return sum(f.world_from_camera is not None for f in run.frames[:end])
+
+
 def _percent(part: int, whole: int) -> float:
     return round(100.0 * part / whole, 2) if whole else 0.0
-
-
-def _within(trajectory: Trajectory, stamps_ns: np.ndarray[Any, np.dtype[np.int64]]) -> Trajectory:
-    if len(stamps_ns) == 0:
-        return trajectory
-    margin = half_period(stamps_ns)
-    inside = (trajectory.stamps_ns >= stamps_ns[0] - margin) & (trajectory.stamps_ns <= stamps_ns[-1] + margin)
-    return Trajectory(trajectory.stamps_ns[inside], trajectory.poses[inside])

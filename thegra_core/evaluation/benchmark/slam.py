@@ -8,8 +8,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import signal
-import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,17 +20,17 @@ from thegra_core.config import load_config
 from thegra_core.errors import ConfigError, InputError
 from thegra_core.evaluation.benchmark.peers import best_peer, median_or_none
 from thegra_core.evaluation.scores import read_intervals, read_stamps
-from thegra_core.messages import FloatArray, IntArray
+from thegra_core.evaluation.tasks import RAN, run_process
+from thegra_core.messages import FloatArray
 from thegra_core.outputs.files import write_atomic
-from thegra_core.outputs.scoring import half_period, score_trajectory
+from thegra_core.outputs.scoring import MIN_COVERAGE_PCT, score_trajectory, spread_of, within
 from thegra_core.outputs.trajectory import Trajectory, read_tum
 from thegra_core.sources.open import open_recording
 from thegra_core.version import VERSION
 
-_RAN = (0, 1)
-"""Exit codes of `thegra run` that come with results: done, nothing tracked."""
-_ERROR_CHARACTERS = 2000
 _FROM_METRICS = ("frames_total", "maps", "losses", "relocalizations", "loops", "shutter_closures", "keyframes", "landmarks", "finish_s", "cached_pct", "peak_rss_mb")
+_COUNTED = ("tracked_pct", "recall_1pct")
+"""Figures for which a frame without a pose is a miss already."""
 _STILL = 1e-6
 
 
@@ -122,16 +120,13 @@ def execute(run: PlannedRun, plan: Plan) -> RunResult:
     run.folder.mkdir(parents=True, exist_ok=True)
     for stale in (*run.folder.glob("*.json"), *run.folder.glob("*.txt")):
         stale.unlink()
-    child = subprocess.run(command(run, plan), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace", check=False)
-    said = child.stderr.strip()[-_ERROR_CHARACTERS:]
-    if child.returncode < 0:
-        said = f"{said}\nended by {signal.Signals(-child.returncode).name}".strip()
-    if child.returncode not in _RAN or not (run.folder / "metrics.json").is_file():
-        return RunResult(run, child.returncode, {}, said or f"exit code {child.returncode}")
+    code, said = run_process(command(run, plan))
+    if code not in RAN or not (run.folder / "metrics.json").is_file():
+        return RunResult(run, code, {}, said or f"exit code {code}")
     try:
-        return RunResult(run, child.returncode, figures_of(run))
+        return RunResult(run, code, figures_of(run))
     except InputError as error:
-        return RunResult(run, child.returncode, {}, str(error))
+        return RunResult(run, code, {}, str(error))
 
 
 def command(run: PlannedRun, plan: Plan) -> list[str]:
@@ -163,6 +158,8 @@ def figures_of(run: PlannedRun) -> dict[str, Any]:
         "poses": sum(len(t) for t in trajectories),
         "extent": max((_diagonal(t.positions) for t in trajectories), default=0.0),
         "s_per_frame": {p: None if ms[p] is None else round(ms[p] / 1e3, 4) for p in ("p50", "p95")},
+        "fps": metrics.get("fps"),
+        "ms_stages": {stage: values["p50"] for stage, values in metrics.get("ms", {}).items()},
     }
     return figures | _scores(run, metrics)
 
@@ -174,33 +171,21 @@ def _scores(run: PlannedRun, metrics: Mapping[str, Any]) -> dict[str, Any]:
     none = {"truth": "none", "tracked_pct": metrics["tracked_pct"], "ate_rmse": None, "ate_rel": None, "in_closure": 0, "spread": None}
     if not files["images"].is_file() or truth_file is None:
         truth = read_tum(truth_file) if truth_file is not None else None
-        scored = {key: metrics.get(key) for key in ("ate_rmse", "ate_rel")}
-        return none | scored | ({"truth": _kind(truth), "spread": _spread(truth.positions)} if truth is not None else {})
+        scored = {key: metrics.get(key) for key in ("ate_rmse", "ate_rel", "ate_pct", "ate_live_rmse", "recall_1pct", "rot_deg")}
+        return none | scored | ({"truth": _kind(truth), "spread": spread_of(truth.positions)} if truth is not None else {})
     stamps = read_stamps(files["images"])[: run.max_frames]
-    truth = _within(read_tum(truth_file), stamps)
+    truth = within(read_tum(truth_file), stamps)
     closures = read_intervals(files["shutter"]) if files["shutter"].is_file() else ()
-    score = score_trajectory(read_tum(run.folder / "trajectory.txt"), truth, stamps, closures_ns=closures)
-    return {key: getattr(score, key) for key in ("tracked_pct", "ate_rmse", "ate_rel", "ate_pct", "rot_deg", "in_closure")} | {
+    score, live = (score_trajectory(read_tum(run.folder / name), truth, stamps, closures_ns=closures) for name in ("trajectory.txt", "trajectory_live.txt"))
+    return {key: getattr(score, key) for key in ("tracked_pct", "ate_rmse", "ate_rel", "ate_pct", "recall_1pct", "rot_deg", "in_closure")} | {
+        "ate_live_rmse": live.ate_rmse if live.covered else None,
         "truth": _kind(truth),
-        "spread": _spread(truth.positions),
+        "spread": spread_of(truth.positions),
     }
-
-
-def _within(trajectory: Trajectory, stamps_ns: IntArray) -> Trajectory:
-    if len(stamps_ns) == 0:
-        return trajectory
-    margin = half_period(stamps_ns)
-    inside = (trajectory.stamps_ns >= stamps_ns[0] - margin) & (trajectory.stamps_ns <= stamps_ns[-1] + margin)
-    return Trajectory(trajectory.stamps_ns[inside], trajectory.poses[inside])
 
 
 def _kind(truth: Trajectory) -> str:
     return "moving" if len(truth) and _diagonal(truth.positions) > _STILL else "still"
-
-
-def _spread(positions: FloatArray) -> float:
-    """RMS distance of positions (N, 3) from their centroid: an aligned trajectory cannot have a larger ATE."""
-    return float(np.sqrt(np.mean(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1)))) if len(positions) else 0.0
 
 
 def _diagonal(positions: FloatArray) -> float:
@@ -213,18 +198,23 @@ def _diagonal(positions: FloatArray) -> float:
 def summarize(results: Sequence[RunResult]) -> dict[str, Any]:
     """Figures of the runs of one recording with one profile: medians and every seed's value; None of a seed stands for the worst.
 
+    A run that tracks less than `MIN_COVERAGE_PCT` has no error here; `runs` has what there is.
     Time is that of the first run that did not fail; memory the most of any.
     """
     first = results[0].run
     ran = [r.figures for r in results if r.figures]
     summary: dict[str, Any] = {"recording": first.name, "profile": first.profile, "max_frames": first.max_frames, "seeds": [r.run.seed for r in results]}
     summary["failed"] = [{"seed": r.run.seed, "exit_code": r.exit_code, "error": r.error} for r in results if r.error is not None]
-    for key in ("tracked_pct", "ate_rmse", "ate_rel"):
-        values = [r.figures.get(key) for r in results]
-        summary[key] = {"median": median_or_none([f[key] for f in ran], worst=0.0 if key == "tracked_pct" else np.inf), "seeds": values}
+    for key in ("tracked_pct", "ate_rmse", "ate_rel", "ate_pct", "ate_live_rmse", "recall_1pct"):
+        told = [f.get(key) if key in _COUNTED or f["tracked_pct"] >= MIN_COVERAGE_PCT else None for f in ran]
+        values = iter(told)
+        summary[key] = {
+            "median": median_or_none(told, worst=0.0 if key in _COUNTED else np.inf),
+            "seeds": [next(values) if r.figures else None for r in results],
+        }
     for key in ("maps", "losses", "poses", "extent", "in_closure"):
         summary[key] = [r.figures.get(key) for r in results]
-    summary |= {key: ran[0][key] if ran else None for key in ("truth", "spread", "s_per_frame", "cached_pct")}
+    summary |= {key: ran[0].get(key) if ran else None for key in ("truth", "spread", "s_per_frame", "cached_pct", "fps", "ms_stages")}
     summary["peak_rss_mb"] = max((f["peak_rss_mb"] for f in ran), default=None)
     summary["runs"] = [{"seed": r.run.seed, "folder": str(r.run.folder), "exit_code": r.exit_code} | dict(r.figures) for r in results]
     return summary

@@ -15,7 +15,7 @@ from thegra_core.outputs.metrics import RunScores
 from thegra_core.outputs.report.figures import counts_figure, error_figure, stages_figure, trajectory_figure
 from thegra_core.outputs.report.frames import pictures
 from thegra_core.outputs.report.timeline import Fate, Stretch, events, fate_of, stretches
-from thegra_core.outputs.scoring import RunPoses
+from thegra_core.outputs.scoring import MIN_COVERAGE_PCT, RunPoses
 from thegra_core.outputs.trajectory import NS_PER_S, Trajectory, final_trajectory, predicted_trajectory
 
 _MAX_LISTED = 12
@@ -135,6 +135,8 @@ def _error_tile(m: Mapping[str, Any]) -> Tile:
         return Tile("ATE RMSE", "-", "no ground truth given")
     if m["ate_rmse"] is None:
         return Tile("ATE RMSE", "-", "fewer than 3 frames with pose and ground truth")
+    if m["tracked_pct"] < MIN_COVERAGE_PCT:
+        return Tile("ATE RMSE", "-", f"fewer than {MIN_COVERAGE_PCT:g} % of the frames have a pose")
     share = f"{m['ate_pct']:.2f} % of a path of {m['path_length']:.4g} m · " if m["ate_pct"] is not None else ""
     return Tile("ATE RMSE", f"{m['ate_rmse']:.3g} m", f"{share}over {m['ate_pairs']} frames, Sim(3)")
 
