@@ -79,5 +79,8 @@ setup(
     zip_safe=False,
     install_requires=REQUIRES,
     extras_require=EXTRAS,
-    entry_points={"console_scripts": ["thegra = thegra_core.cli.main:main"]},
+    entry_points={
+        "console_scripts": ["thegra = thegra_core.cli.main:main", "slam = thegra_ros.nodes.slam:main"],
+        "thegra.commands": ["live = thegra_ros.commands:live", "play = thegra_ros.commands:play"],
+    },
 )
