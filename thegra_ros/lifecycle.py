@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -143,7 +144,11 @@ class ManagedNode(LifecycleNode):
 
 def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = None) -> int:
     """Run a node until it is told to end (SIGINT, SIGTERM); the exit code: 0, or 2 if it could not start."""
-    rclpy.init(args=arguments)
+    try:
+        rclpy.init(args=arguments)
+    except Exception as error:  # RCLError is no public class
+        print(f"thegra: ROS arguments not understood: {error}", file=sys.stderr)
+        return 2
     node: ManagedNode | None = None
     executor = SingleThreadedExecutor()
     try:

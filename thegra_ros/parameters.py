@@ -72,7 +72,7 @@ def from_ros(values: Mapping[str, Any], defaults: ThegraConfig) -> ThegraConfig:
         node = tree
         for section in sections:
             node = node[section]
-        node[last] = yaml.safe_load(value) if name == "preprocessing.filters" else None if value == "none" and not isinstance(node[last], str) else value
+        node[last] = _filters(value) if name == "preprocessing.filters" else None if value == "none" and not isinstance(node[last], str) else value
     return validated(ThegraConfig, tree)
 
 
@@ -132,6 +132,15 @@ def load_defaults(node: Node) -> ThegraConfig:
     return load_config(values["profile"] or None, Path(values["config_file"]).expanduser() if values["config_file"] else None)
 
 
+def _filters(text: str) -> Any:
+    """A YAML list of filters, or their names alone with commas between them."""
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"preprocessing.filters is no YAML: {error}") from error
+    return [{"filter": name.strip()} for name in values.split(",")] if isinstance(values, str) else values
+
+
 def _plain(value: Any) -> Any:
     return value if isinstance(value, bool | int | float | str) else [float(item) for item in value]
 
@@ -171,5 +180,5 @@ def _constraints(field: FieldInfo, exclusive: list[str]) -> str:
     if origin in (types.UnionType, typing.Union):
         return "a number or none"
     if origin is tuple and typing.get_args(annotation)[0] is not float:
-        return "YAML list of {filter: NAME, PARAMETER: VALUE, ...}"
+        return "names with commas, or a YAML list of {filter: NAME, PARAMETER: VALUE, ...}"
     return ", ".join(exclusive)
