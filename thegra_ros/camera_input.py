@@ -10,6 +10,7 @@ from sensor_msgs.msg import CameraInfo
 from thegra_core.errors import CalibrationError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.sources.calibration import camera_from_info, load_camera
+from thegra_ros.diagnostics import Health
 from thegra_ros.lifecycle import ManagedNode
 from thegra_ros.qos import SENSOR
 
@@ -23,13 +24,13 @@ class CameraInput:
         CalibrationError: If the file cannot be used.
     """
 
-    def __init__(self, node: ManagedNode, file: str, on_change: Callable[[str], None]) -> None:
-        self._node = node
+    def __init__(self, node: ManagedNode, file: str, health: Health, on_change: Callable[[str], None]) -> None:
+        self._node, self._health = node, health
         self._on_change = on_change
         self._seen: tuple[object, ...] | None = None
         self._topic = node.resolve_topic_name("camera_info")
         self.camera: CameraModel | None = load_camera(Path(file).expanduser()) if file else None
-        self.trouble = "" if self.camera else f"no camera_info on {self._topic} yet: remap camera_info to your driver's topic, or give the parameter camera_file"
+        self._health.camera_trouble = "" if self.camera else f"no camera_info on {self._topic} yet: remap camera_info to your driver's topic, or give the parameter camera_file"
         if self.camera is None:
             node.listen(CameraInfo, "camera_info", SENSOR, self._on_info)
         node.every(COMPLAINT_PERIOD_S, self._complain)
@@ -41,9 +42,9 @@ class CameraInput:
         self._seen = seen
         try:
             camera = camera_from_info(info)
-            self.trouble = "" if camera else f"{self._topic} says that the camera is not calibrated (its K is zero): calibrate it, and give the parameter camera_file"
+            self._health.camera_trouble = "" if camera else f"{self._topic} says that the camera is not calibrated (its K is zero): calibrate it, and give the parameter camera_file"
         except CalibrationError as error:
-            camera, self.trouble = None, f"{self._topic} cannot be used: {error}"
+            camera, self._health.camera_trouble = None, f"{self._topic} cannot be used: {error}"
         before, self.camera = self.camera, camera
         if camera is None:
             return
@@ -54,5 +55,5 @@ class CameraInput:
             self._node.get_logger().info(f"camera {what}, from {self._topic}")
 
     def _complain(self) -> None:
-        if self.trouble and self._node.active:
-            self._node.get_logger().warning(self.trouble)
+        if self._health.camera_trouble and self._node.active:
+            self._node.get_logger().warning(self._health.camera_trouble)

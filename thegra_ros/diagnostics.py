@@ -32,18 +32,19 @@ _WORDS = {
     TrackingState.LOST: "lost",
 }
 SILENCE_S = 2.0
-"""Without an image for so long nothing is OK."""
+"""Without an image received or worked on for so long nothing is OK."""
 
 
 @dataclass
 class Health:
-    """The facts that a node collects for its diagnostics; `trouble` says what keeps it from working at all."""
+    """The facts that a node collects for its diagnostics; `trouble` and `camera_trouble` say what keeps it from working at all."""
 
     state: TrackingState = TrackingState.WAITING
     reason: str = ""
     paused: bool = False
     trouble: str = ""
-    last_image_s: float | None = None
+    camera_trouble: str = ""
+    last_sign_s: float | None = None
     images: int = 0
     done: int = 0
     bad: Counter[str] = field(default_factory=Counter)
@@ -51,13 +52,14 @@ class Health:
     def image_came(self) -> None:
         """An image was received."""
         self.images += 1
-        self.last_image_s = time.monotonic()
+        self.last_sign_s = time.monotonic()
 
     def result_came(self, result: TrackingResult) -> bool:
         """A frame was worked on; True if that changes what there is to say."""
         changed = result.state is not self.state
         self.state, self.reason = result.state, result.reason
         self.done += 1
+        self.last_sign_s = time.monotonic()
         return changed
 
 
@@ -80,14 +82,14 @@ class Reporter:
 
 def judge(health: Health, now_s: float) -> tuple[bytes, str]:
     """Level and message of a node's health at a monotonic time (s)."""
-    if health.trouble:
-        return DiagnosticStatus.ERROR, health.trouble
+    if health.trouble or health.camera_trouble:
+        return DiagnosticStatus.ERROR, health.trouble or health.camera_trouble
     if health.paused:
         return DiagnosticStatus.WARN, "paused: images are ignored"
-    if health.last_image_s is None:
+    if health.last_sign_s is None:
         return DiagnosticStatus.WARN, "no image yet"
-    if now_s - health.last_image_s > SILENCE_S:
-        return DiagnosticStatus.WARN, f"no image for {now_s - health.last_image_s:.0f} s"
+    if now_s - health.last_sign_s > SILENCE_S:
+        return DiagnosticStatus.WARN, f"no image for {now_s - health.last_sign_s:.0f} s"
     words = _WORDS[health.state]
     return LEVELS[health.state], f"{words}: {health.reason}" if health.reason and health.state is not TrackingState.TRACKING else words
 

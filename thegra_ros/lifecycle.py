@@ -147,7 +147,7 @@ def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = 
     try:
         rclpy.init(args=arguments)
     except Exception as error:  # RCLError is no public class
-        print(f"thegra: ROS arguments not understood: {error}", file=sys.stderr)
+        sys.stderr.write(f"thegra: ROS arguments not understood: {error}\n")
         return 2
     node: ManagedNode | None = None
     executor = SingleThreadedExecutor()

@@ -20,7 +20,7 @@ class NodeConfig(Section):
     odom_frame: str = Field("", description="odometry frame, if something publishes odom_frame -> base_frame on /tf; then map_frame -> odom_frame is published")
     base_frame: str = Field("", description="robot frame whose pose is published; empty: the camera's")
     camera_frame: str = Field("", description="optical frame of the camera; empty: the images' frame_id")
-    base_from_camera: tuple[float, ...] = Field((), description="x, y, z (m), qx, qy, qz, qw of the optical camera frame in base_frame; empty: from /tf_static, else the camera looks forward from base_frame")
+    base_from_camera: str = Field("", description="x y z (m) qx qy qz qw of the optical camera frame in base_frame; empty: from /tf_static, else the camera looks forward from base_frame")
     publish_tf: bool = Field(True, description="publish the pose on /tf")
     scale: float = Field(1.0, gt=0, description="metres of one map unit; one camera does not see size")
     path_length: int = Field(1000, ge=2, description="poses of path at the most; then every second one goes")

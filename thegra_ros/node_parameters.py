@@ -41,7 +41,7 @@ class NodeParameters:
         for change in changes:
             for values in (method, own):
                 if change.name in values:
-                    values[change.name] = list(change.value) if isinstance(values[change.name], list) else change.value
+                    values[change.name] = change.value
                     concerned = True
         if not concerned:
             return SetParametersResult(successful=True)
@@ -55,4 +55,4 @@ class NodeParameters:
         return SetParametersResult(successful=True)
 
     def _validated(self, method: dict[str, Any], own: dict[str, Any]) -> tuple[ThegraConfig, NodeConfig]:
-        return from_ros(method, self._defaults), validated(NodeConfig, {name: tuple(value) if isinstance(value, list) else value for name, value in own.items()})
+        return from_ros(method, self._defaults), validated(NodeConfig, own)

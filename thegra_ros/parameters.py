@@ -25,7 +25,7 @@ from thegra_core.errors import ConfigError
 
 _TYPES = {bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGER, float: ParameterType.PARAMETER_DOUBLE, str: ParameterType.PARAMETER_STRING}
 _NAMES = {ParameterType.PARAMETER_BOOL: "true or false", ParameterType.PARAMETER_INTEGER: "a whole number", ParameterType.PARAMETER_DOUBLE: "a number with a point, as in 1.0",
-          ParameterType.PARAMETER_STRING: "a text in quotes", ParameterType.PARAMETER_DOUBLE_ARRAY: "a list of numbers with a point"}  # fmt: skip
+          ParameterType.PARAMETER_STRING: "a text in quotes"}  # fmt: skip
 _LARGEST = 2**63 - 1
 ModelT = typing.TypeVar("ModelT", bound=BaseModel)
 FIXED = ("profile", "config_file")
@@ -55,9 +55,9 @@ def to_ros(value: Any) -> Any:
     """A field's value as ROS holds it."""
     if value is None:
         return "none"
-    if isinstance(value, tuple) and not all(isinstance(item, float) for item in value):
+    if isinstance(value, tuple):
         return yaml.safe_dump([item.model_dump(mode="json") for item in value], default_flow_style=True, width=10**6, sort_keys=False).strip()
-    return list(value) if isinstance(value, tuple) else value
+    return value
 
 
 def from_ros(values: Mapping[str, Any], defaults: ThegraConfig) -> ThegraConfig:
@@ -110,7 +110,7 @@ def declare(node: Node, parameters: typing.Iterable[Declared]) -> dict[str, Any]
     values: dict[str, Any] = {}
     for parameter in parameters:
         try:
-            values[parameter.name] = _plain(node.declare_parameter(parameter.name, parameter.value, parameter.descriptor).value)
+            values[parameter.name] = node.declare_parameter(parameter.name, parameter.value, parameter.descriptor).value
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             given = node._parameter_overrides.get(parameter.name)  # rclpy offers no other way to what was given
             wanted = _NAMES[parameter.descriptor.type]
@@ -141,18 +141,10 @@ def _filters(text: str) -> Any:
     return [{"filter": name.strip()} for name in values.split(",")] if isinstance(values, str) else values
 
 
-def _plain(value: Any) -> Any:
-    return value if isinstance(value, bool | int | float | str) else [float(item) for item in value]
-
-
 def _kind(field: FieldInfo) -> int:
     annotation, origin = field.annotation, typing.get_origin(field.annotation)
     if origin is Literal:
         return ParameterType.PARAMETER_STRING if isinstance(typing.get_args(annotation)[0], str) else ParameterType.PARAMETER_INTEGER
-    if origin in (types.UnionType, typing.Union):
-        return ParameterType.PARAMETER_STRING
-    if origin is tuple:
-        return ParameterType.PARAMETER_DOUBLE_ARRAY if typing.get_args(annotation)[0] is float else ParameterType.PARAMETER_STRING
     return _TYPES[annotation] if isinstance(annotation, type) and annotation in _TYPES else ParameterType.PARAMETER_STRING
 
 
@@ -179,6 +171,6 @@ def _constraints(field: FieldInfo, exclusive: list[str]) -> str:
         return "one of: " + ", ".join(str(item) for item in typing.get_args(annotation))
     if origin in (types.UnionType, typing.Union):
         return "a number or none"
-    if origin is tuple and typing.get_args(annotation)[0] is not float:
+    if origin is tuple:
         return "names with commas, or a YAML list of {filter: NAME, PARAMETER: VALUE, ...}"
     return ", ".join(exclusive)

@@ -7,7 +7,7 @@ then, with x forward, y left and z up as that frame has them. A map has no metri
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -148,13 +148,16 @@ def chain(parents: Mapping[str, tuple[str, FloatArray]], base: str, frame: str) 
     return None
 
 
-def extrinsics(numbers: Sequence[float]) -> FloatArray:
-    """(4, 4) of x, y, z, qx, qy, qz, qw.
+def extrinsics(text: str) -> FloatArray:
+    """(4, 4) of `x y z qx qy qz qw`, with spaces or commas between them.
 
     Raises:
-        ValueError: If there are not seven, or the quaternion is zero.
+        ValueError: If they are not seven numbers, or the quaternion is zero.
     """
-    values = np.asarray(numbers, dtype=np.float64)
+    try:
+        values = np.array([float(part) for part in text.replace(",", " ").split()])
+    except ValueError:
+        values = np.empty(0)
     if values.shape != (7,) or not np.all(np.isfinite(values)) or not np.any(values[3:]):
-        raise ValueError(f"{list(numbers)} are not x, y, z, qx, qy, qz, qw of the optical camera frame in the base frame")
+        raise ValueError(f"{text!r} is not x y z qx qy qz qw of the optical camera frame in the base frame")
     return transform(rotation_from_quaternion(values[3:]), values[:3])

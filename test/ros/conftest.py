@@ -17,9 +17,9 @@ from thegra_core.simulation.demo import make_demo_bag, thermal_camera
 from thegra_core.sources.open import open_recording
 
 if TYPE_CHECKING:
-    from thegra_core.geometry.camera import CameraModel
-
     from ros_graph import Graph
+
+    from thegra_core.geometry.camera import CameraModel
 
 if importlib.util.find_spec("rclpy") is not None:
     with warnings.catch_warnings():  # its parser imports a module that Python has deprecated

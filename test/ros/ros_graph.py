@@ -18,7 +18,8 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.srv import ChangeState, GetState
-from nav_msgs.msg import Odometry, Path as PathMessage
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
@@ -30,7 +31,7 @@ from thegra_ros.codec.images import camera_info_message, image_message
 from thegra_ros.codec.stamps import header
 from thegra_ros.qos import LATCHED, LOSSLESS, RELIABLE
 
-LIMIT_S = 120.0
+LIMIT_S = float(os.environ.get("THEGRA_TEST_LIMIT_S", "120"))
 NAMESPACE = "/thegra"
 FAST = {"profile": "fast", "extractor.name": "orb", "preprocessing.filters": "he_clip", "loop.enabled": "false"}
 """Parameters with which no network is needed, and a frame takes a tenth of a second."""
@@ -146,6 +147,10 @@ class Graph:
     def status(self) -> DiagnosticStatus | None:
         heard = self.received["/diagnostics"]
         return heard[-1].status[0] if heard else None
+
+    def heard(self, level: bytes, text: str) -> bool:
+        """Whether /diagnostics has said that, at any time."""
+        return any(s.level == level and text in s.message for message in self.received["/diagnostics"] for s in message.status)
 
     def value(self, key: str) -> str:
         status = self.status

@@ -108,7 +108,7 @@ def test_fixed_transforms_are_chained_up_to_the_base() -> None:
 
 
 def test_extrinsics_are_checked() -> None:
-    np.testing.assert_allclose(extrinsics([1, 2, 3, 0, 0, 0, 2]), transform(np.eye(3), [1, 2, 3]))
-    for bad in ([1, 2, 3], [0] * 7, [np.nan, 0, 0, 0, 0, 0, 1]):
+    np.testing.assert_allclose(extrinsics("1, 2, 3 0 0 0 2"), transform(np.eye(3), [1, 2, 3]))
+    for bad in ("1 2 3", "0 0 0 0 0 0 0", "nan 0 0 0 0 0 1", "a b c d e f g"):
         with pytest.raises(ValueError, match="qw"):
             extrinsics(bad)

@@ -62,7 +62,7 @@ class SlamNode(ManagedNode):
         self._map_sent_ns, self._map_id, self._ms, self._age_ms = 0, -1, 0.0, 0.0
         self._health = Health()
         self._reporter = Reporter(self, self._health, self._facts)
-        self._camera = CameraInput(self, self._own.camera_file, self._begin_anew)
+        self._camera = CameraInput(self, self._own.camera_file, self._health, self._begin_anew)
         self._poses, self._map, self._tracks = PoseOutputs(self, self._frames, self._own), MapOutputs(self), TracksOutput(self)
         raw = self._own.image_transport == "raw"
         self.listen(Image if raw else CompressedImage, "image_raw" if raw else "image_raw/compressed", SENSOR, self._on_image)
