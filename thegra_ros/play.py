@@ -63,6 +63,10 @@ def play(options: PlayOptions) -> int:
         player.play(recording)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
+    except Exception:
+        if rclpy.ok():
+            raise
+        return 0  # told to end while an image was being sent
     finally:
         rclpy.try_shutdown()
     return 0
