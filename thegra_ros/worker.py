@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
@@ -19,13 +20,15 @@ T = TypeVar("T")
 class Worker(Generic[T]):
     """Takes items from a bounded queue; `to_job` makes a job of one when its turn comes.
 
-    `on_done` gets item, result and milliseconds; `on_failure` a text, and whether that is the end. Both are called from the thread.
+    `on_done` gets item, result and milliseconds; `on_failure` a text, and whether that is the end. Both are called from the thread. `is_alive` is False
+    once the process is told to end: then failures are no news.
     """
 
     def __init__(
-        self, make_engine: Callable[[], Engine], queue_size: int, to_job: Callable[[T], Job], on_done: Callable[[T, Done, float], None], on_failure: Callable[[str, bool], None]
-    ) -> None:
-        self._make_engine, self._to_job, self._on_done, self._on_failure = make_engine, to_job, on_done, on_failure
+        self, make_engine: Callable[[], Engine], queue_size: int, to_job: Callable[[T], Job], on_done: Callable[[T, Done, float], None],
+        on_failure: Callable[[str, bool], None], is_alive: Callable[[], bool] = lambda: True,
+    ) -> None:  # fmt: skip
+        self._make_engine, self._to_job, self._on_done, self._on_failure, self._is_alive = make_engine, to_job, on_done, on_failure, is_alive
         self.queue: LatestQueue[T] = LatestQueue(queue_size)
         self._engine: Engine | None = None
         self._stopping = False
@@ -53,11 +56,11 @@ class Worker(Generic[T]):
             except ThegraError as error:  # something the user has to put right first
                 self._on_failure(str(error), True)
                 return
-            except EngineError as error:
-                if self._stopping:
+            except Exception as error:  # a thread that ends without a word would be a node that does nothing
+                if self._stopping or not self._is_alive():
                     return
                 failures = failures + 1 if self._engine_worked == 0 else 1
-                self._on_failure(str(error), failures == MOST_FAILURES)
+                self._on_failure(str(error) if isinstance(error, EngineError) else traceback.format_exc(), failures == MOST_FAILURES)
             finally:
                 if self._engine is not None:
                     self._engine.stop()

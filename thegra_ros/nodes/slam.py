@@ -70,7 +70,7 @@ class SlamNode(ManagedNode):
         self.serve(SetBool, "~/pause", self._on_pause)
         backwards = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         self._jumps = self.get_clock().create_jump_callback(backwards, post_callback=self._on_jump)
-        self._worker = Worker(self._new_engine, self._own.queue_size, self._to_job, self._on_done, self._on_failure)
+        self._worker = Worker(self._new_engine, self._own.queue_size, self._to_job, self._on_done, self._on_failure, self.context.ok)
         self._worker.start()
         self._settings.configured = True
         self.get_logger().info(f"profile {self._config.profile}; images from {self.resolve_topic_name('image_raw')}")
