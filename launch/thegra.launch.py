@@ -7,10 +7,11 @@ import os
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
-from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import LifecycleNode, Node
+
+from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 
 PACKAGE = "thegra_ros"
 STAGES = ("preprocessing", "frontend", "tracking", "mapping")
@@ -50,7 +51,7 @@ def actions(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             package=PACKAGE, executable=name, name=name, namespace=given["namespace"], output="screen", emulate_tty=True,
             parameters=[given["params_file"] or str(config / "params.yaml"), parameters(given)], remappings=remappings(given),
             arguments=["--ros-args", "--log-level", f"{given['namespace'].strip('/').replace('/', '.')}.{name}:={given['log_level']}".lstrip(".")],
-        )  # fmt: skip
+        )
         for name in names
     ]
     if is_true(given["rviz"]):

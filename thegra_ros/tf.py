@@ -13,7 +13,7 @@ from thegra_ros.codec.poses import pose_matrix, transform_message
 from thegra_ros.codec.stamps import header, stamp_ns
 from thegra_ros.lifecycle import ManagedNode
 from thegra_ros.qos import TF, TF_STATIC
-from thegra_ros.transforms import BODY_FROM_OPTICAL, Frames, PoseHistory, StampedPose, chain
+from thegra_ros.transforms import Frames, PoseHistory, StampedPose, chain
 
 FloatArray = NDArray[np.float64]
 
@@ -26,13 +26,30 @@ def transform_type() -> Any | None:
         return None
 
 
+class FixedTransforms:
+    """The transforms heard on /tf_static; none where tf2_msgs is not installed."""
+
+    def __init__(self, node: ManagedNode) -> None:
+        self._parents: dict[str, tuple[str, FloatArray]] = {}
+        kind = transform_type()
+        if kind is not None:
+            node.listen(kind, "/tf_static", TF_STATIC, self._on_message)
+
+    def find(self, base: str, frame: str) -> FloatArray | None:
+        """base_from_frame (4, 4); None where they do not tell."""
+        return chain(self._parents, base, frame)
+
+    def _on_message(self, message: Any) -> None:
+        for stamped in message.transforms:
+            self._parents[stamped.child_frame_id] = (stamped.header.frame_id, pose_matrix(stamped.transform))
+
+
 class TransformPublisher:
     """Publishes a pose on /tf: map -> odom where an odometry frame is named, else map -> base or map -> camera."""
 
     def __init__(self, node: ManagedNode, frames: Frames, enabled: bool = True) -> None:
         self._node = node
         self._odometry = PoseHistory()
-        self._fixed: dict[str, tuple[str, FloatArray]] = {}
         self._kind = transform_type() if enabled else None
         self._publisher: Any = None
         self._map_from_odom: FloatArray | None = None
@@ -41,14 +58,8 @@ class TransformPublisher:
             node.get_logger().warning("no transforms: tf2_msgs is not installed (sudo apt install ros-$ROS_DISTRO-tf2-msgs); poses are on the topics all the same")
         if self._kind is not None:
             self._publisher = node.publisher(self._kind, "/tf", TF)
-            if frames.base:
-                node.listen(self._kind, "/tf_static", TF_STATIC, self._on_static)
             if frames.odom:
                 node.listen(self._kind, "/tf", TF, self._on_moving)
-
-    def base_from_camera(self, camera_frame: str) -> FloatArray | None:
-        """(4, 4) of the fixed transforms heard on /tf_static; None where they do not tell."""
-        return chain(self._fixed, self._frames.base, camera_frame)
 
     def publish(self, pose: StampedPose, frames: Frames) -> None:
         """Publish a tracked pose."""
@@ -75,16 +86,7 @@ class TransformPublisher:
         if self._publisher is not None and self._kind is not None:
             self._publisher.publish(self._kind(transforms=[transform_message(header(stamp, parent), child, parent_from_child)]))
 
-    def _on_static(self, message: Any) -> None:
-        for stamped in message.transforms:
-            self._fixed[stamped.child_frame_id] = (stamped.header.frame_id, pose_matrix(stamped.transform))
-
     def _on_moving(self, message: Any) -> None:
         for stamped in message.transforms:
             if (stamped.header.frame_id, stamped.child_frame_id) == (self._frames.odom, self._frames.base):
                 self._odometry.add(stamp_ns(stamped), pose_matrix(stamped.transform))
-
-
-def camera_looks_forward() -> FloatArray:
-    """base_from_camera where nothing tells it: at the base, looking along its x axis."""
-    return BODY_FROM_OPTICAL.copy()

@@ -12,8 +12,8 @@ from rcl_interfaces.msg import ParameterType
 
 from thegra_core.config import PROFILES, Median, load_config
 from thegra_core.errors import ConfigError
+from thegra_ros.camera_place import frames_of
 from thegra_ros.node_config import NodeConfig
-from thegra_ros.nodes.slam import frames_of
 from thegra_ros.parameters import Declared, declared, from_ros
 
 

@@ -7,31 +7,22 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from rclpy.clock import JumpHandle, JumpThreshold, TimeJump
-from rclpy.duration import Duration
-from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
-from thegra_core.errors import ConfigError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame, TrackingState
 from thegra_core.process import keep_freed_memory
-from thegra_core.sources.image_decoding import DecodeError
 from thegra_ros.camera_input import CameraInput
-from thegra_ros.codec.images import frame_from_image
+from thegra_ros.camera_place import CameraPlace
 from thegra_ros.diagnostics import Health, Reporter
 from thegra_ros.engine import Done, Engine, Job, LocalEngine, ProcessEngine
+from thegra_ros.image_input import ImageInput
 from thegra_ros.lifecycle import ManagedNode, run_node
-from thegra_ros.node_config import NodeConfig
 from thegra_ros.node_parameters import NodeParameters
 from thegra_ros.outputs import MapOutputs, PoseOutputs, TracksOutput
-from thegra_ros.qos import SENSOR
-from thegra_ros.stamp_watch import StampWatch
-from thegra_ros.transforms import BODY_FROM_OPTICAL, Frames, extrinsics
 from thegra_ros.worker import Worker
 
 
@@ -51,25 +42,21 @@ class SlamNode(ManagedNode):
         super().__init__("slam", **options)
         self._settings = NodeParameters(self)
         self._worker: Worker[Waiting] | None = None
-        self._jumps: JumpHandle | None = None
+        self._images: ImageInput | None = None
 
     # ---- transitions ----------------------------------------------------------------------------------------------------------------
 
     def configure(self) -> None:
         self._config, self._own = self._settings.read()
-        self._frames = frames_of(self._own)
-        self._stamps, self._epoch, self._index = StampWatch(), 0, 0
+        self._place, self._epoch = CameraPlace(self, self._own), 0
         self._map_sent_ns, self._map_id, self._ms, self._age_ms = 0, -1, 0.0, 0.0
         self._health = Health()
         self._reporter = Reporter(self, self._health, self._facts)
         self._camera = CameraInput(self, self._own.camera_file, self._health, self._begin_anew)
-        self._poses, self._map, self._tracks = PoseOutputs(self, self._frames, self._own), MapOutputs(self), TracksOutput(self)
-        raw = self._own.image_transport == "raw"
-        self.listen(Image if raw else CompressedImage, "image_raw" if raw else "image_raw/compressed", SENSOR, self._on_image)
+        self._poses, self._map, self._tracks = PoseOutputs(self, self._place.frames, self._own), MapOutputs(self), TracksOutput(self)
+        self._images = ImageInput(self, self._own.image_transport, self._health, self._on_frame, self._begin_anew)
         self.serve(Trigger, "~/reset", self._on_reset)
         self.serve(SetBool, "~/pause", self._on_pause)
-        backwards = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
-        self._jumps = self.get_clock().create_jump_callback(backwards, post_callback=self._on_jump)
         self._worker = Worker(self._new_engine, self._own.queue_size, self._to_job, self._on_done, self._on_failure, self.context.ok)
         self._worker.start()
         self._settings.configured = True
@@ -80,36 +67,23 @@ class SlamNode(ManagedNode):
             self._worker.queue.clear()
 
     def release(self) -> None:
-        if self._jumps is not None:
-            self._jumps.unregister()
+        if self._images is not None:
+            self._images.close()
         if self._worker is not None:
             self._worker.stop()
-        self._worker = self._jumps = None
+        self._worker = self._images = None
         self._settings.configured = False
 
     # ---- callbacks: convert, enqueue, return ----------------------------------------------------------------------------------------
 
-    def _on_image(self, message: Image | CompressedImage) -> None:
-        if not self.active or self._worker is None:
-            return
-        self._health.image_came()
-        if self._health.paused:
-            return
-        try:
-            frame = frame_from_image(message, self._index)
-        except DecodeError as error:
-            self._health.bad[str(error)] += 1
-            self.get_logger().warning(f"image not used: {error}", throttle_duration_sec=5.0)
-            return
-        self._index += 1
-        if self._stamps.begins_anew(frame.stamp_ns):
-            self._begin_anew("the images' stamps went back, as those of a bag that loops do")
+    def _on_frame(self, frame: Frame, frame_id: str) -> None:
         camera = self._camera.camera
         if camera is None:
             self._health.bad["image without a camera"] += 1
             return
-        self._place_camera(message.header.frame_id)
-        self._worker.queue.put(Waiting(frame, camera, self._epoch))
+        self._place.see(frame_id)
+        if self._worker is not None:
+            self._worker.queue.put(Waiting(frame, camera, self._epoch))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._begin_anew("reset was called")
@@ -123,32 +97,17 @@ class SlamNode(ManagedNode):
         self._reporter.report()
         return response
 
-    def _on_jump(self, jump: TimeJump) -> None:
-        if jump.delta.nanoseconds < 0:
-            self._begin_anew(f"time went back by {-jump.delta.nanoseconds / 1e9:.1f} s")
-
     def _begin_anew(self, why: str) -> None:
         """Forget map and path; what is in work is for the old map and is thrown away when it comes."""
         self._epoch += 1
-        self._stamps.forget()
+        if self._images is not None:
+            self._images.forget()
         if self._worker is not None:
             self._worker.queue.clear()
         self._poses.forget()
         self._health.state, self._health.reason = TrackingState.INITIALIZING, ""
         self._map_sent_ns = 0
         self.get_logger().info(f"a new map begins: {why}")
-
-    def _place_camera(self, frame_id: str) -> None:
-        """Name the camera's frame after the images, and find where it sits on the base."""
-        camera = self._own.camera_frame or frame_id or "camera"
-        if camera == self._frames.camera:
-            return
-        self._frames = replace(self._frames, camera=camera)
-        if self._own.base_frame and not self._own.base_from_camera:
-            found = self._poses.transforms.base_from_camera(camera)
-            where = "from /tf_static" if found is not None else "nothing tells: taken to be at its origin, looking forward; give base_from_camera"
-            self.get_logger().info(f"place of {camera} on {self._own.base_frame}: {where}")
-            self._frames = replace(self._frames, base_from_camera=found if found is not None else BODY_FROM_OPTICAL)
 
     # ---- the working thread ---------------------------------------------------------------------------------------------------------
 
@@ -167,12 +126,12 @@ class SlamNode(ManagedNode):
             if self._map_id >= 0:
                 self.get_logger().warning(f"lost, and a new map ({result.map_id}) was begun: poses are in a new frame of reference")
             self._map_id = result.map_id
-        self._poses.publish(result, self._frames)
+        self._poses.publish(result, self._place.frames)
         if done.map is not None and result.state is TrackingState.TRACKING:
             self._map_sent_ns = result.stamp_ns
-            self._map.publish(result.stamp_ns, done.map, self._frames)
+            self._map.publish(result.stamp_ns, done.map, self._place.frames)
         if done.view is not None:
-            self._tracks.publish(done.view, self._frames.camera)
+            self._tracks.publish(done.view, self._place.frames.camera)
         self._ms, self._age_ms = ms, (self.get_clock().now().nanoseconds - result.stamp_ns) / 1e6
         if self._health.result_came(result):
             self._reporter.report()
@@ -190,21 +149,6 @@ class SlamNode(ManagedNode):
             "dropped": dropped, "state": self._health.state.value, "map": self._map_id, "ms a frame": f"{self._ms:.0f}", "image to pose ms": f"{self._age_ms:.0f}",
             "camera": "known" if self._camera.camera is not None else "unknown", "scale": f"{self._own.scale:g} m a map unit" if self._own.scale != 1.0 else "unknown",
         }  # fmt: skip
-
-
-def frames_of(own: NodeConfig) -> Frames:
-    """Frame names and extrinsics that the parameters give; the camera's name comes with the first image.
-
-    Raises:
-        ConfigError: If base_from_camera is no pose, or odom_frame is given without base_frame.
-    """
-    if own.odom_frame and not own.base_frame:
-        raise ConfigError(f"odom_frame {own.odom_frame} is given without base_frame, the frame that moves in it: give base_frame, as in base_frame:=base_link")
-    try:
-        placed = extrinsics(own.base_from_camera) if own.base_from_camera else BODY_FROM_OPTICAL
-    except ValueError as error:
-        raise ConfigError(f"base_from_camera: {error}") from error
-    return Frames(own.map_frame, own.odom_frame, own.base_frame, own.camera_frame, np.asarray(placed), own.scale)
 
 
 def main() -> None:
