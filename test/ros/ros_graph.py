@@ -112,11 +112,17 @@ class Graph:
                 raise AssertionError(f"waited in vain for {what or condition}:\n" + "\n".join(p.output for p in self._processes))
             self._executor.spin_once(timeout_sec=0.1)
 
+    def spin_for(self, seconds: float) -> None:
+        """Take messages for a while, between two attempts."""
+        end = time.monotonic() + seconds
+        while (rest := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=rest)
+
     def wait_for_listener(self) -> None:
         self.wait(lambda: self._images.get_subscription_count() > 0 and bool(self.received["/diagnostics"]), "a node that listens to images")
 
-    def send_camera(self, camera: CameraModel) -> None:
-        self.wait(lambda: self._infos.get_subscription_count() > 0, "a node that listens to camera_info")
+    def send_camera(self, camera: CameraModel, listeners: int = 1) -> None:
+        self.wait(lambda: self._infos.get_subscription_count() >= listeners, "nodes that listen to camera_info")
         self._infos.publish(camera_info_message(header(0, "thermal_camera"), camera))
         self._infos.wait_for_all_acked()
 
