@@ -23,6 +23,7 @@ from thegra_core.geometry.camera import CameraModel
 from thegra_ros.transforms import UNKNOWN_VARIANCE
 
 
+@pytest.mark.slow
 def test_bad_input_is_said_and_survived(graph: Graph, frames, camera: CameraModel) -> None:
     node = graph.start()
     graph.wait_for_listener()
@@ -62,6 +63,7 @@ def replace_matrix(camera: CameraModel, factor: float) -> CameraModel:
     return made
 
 
+@pytest.mark.slow
 def test_a_closed_shutter_puts_nothing_on_pose(graph: Graph, frames, camera) -> None:
     node = graph.start()
     graph.wait_for_listener()
@@ -78,6 +80,7 @@ def test_a_closed_shutter_puts_nothing_on_pose(graph: Graph, frames, camera) -> 
     assert node.end() == 0
 
 
+@pytest.mark.slow
 def test_lifecycle_requests_that_are_invalid_end_nothing(graph: Graph, frames, camera) -> None:
     node = graph.start(parameters={"autostart": "false"})
     assert graph.state() == "unconfigured"
@@ -114,6 +117,7 @@ def test_a_transition_that_fails_says_why(graph: Graph, tmp_path) -> None:
     assert node.end() == 0
 
 
+@pytest.mark.slow
 def test_sigterm_during_work(graph: Graph, frames, camera) -> None:
     node = graph.start()
     graph.wait_for_listener()
@@ -124,6 +128,7 @@ def test_sigterm_during_work(graph: Graph, frames, camera) -> None:
     assert node.end(signal.SIGTERM) == 0
 
 
+@pytest.mark.slow
 def test_the_engine_is_started_again_when_it_dies(graph: Graph, frames, camera) -> None:
     node = graph.start()
     graph.wait_for_listener()

@@ -46,6 +46,7 @@ def test_a_recording_is_played_and_tracked(graph: Graph, recording_path: Path, f
     assert f"{len(frames)} images played" in (tmp_path / "play.log").read_text()
 
 
+@pytest.mark.slow
 def test_playing_ends_with_a_signal(graph: Graph, recording_path: Path) -> None:
     play = subprocess.Popen([*THEGRA, "play", str(recording_path), "--loop", "--wait", "0"], env=graph.environment, stderr=subprocess.PIPE, text=True)
     try:

@@ -68,6 +68,7 @@ def test_poses_are_those_of_the_offline_run(graph: Graph, frames, camera, record
     assert node.end(signal.SIGINT) == 0
 
 
+@pytest.mark.slow
 def test_reset_pause_and_stamps_that_go_back(graph: Graph, frames, camera) -> None:
     node = graph.start()
     graph.wait_for_listener()
