@@ -2,6 +2,7 @@
 #
 #   make setup PYTHON=python3.12   use this interpreter
 #   make setup TORCH="torch==2.9"  use this torch, from pip's index
+#   make setup ROS=                leave ROS 2 out
 
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
@@ -14,6 +15,7 @@ TORCH ?=
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH_FALLBACK ?= torch==2.13.0
 EXTRAS ?= dev
+ROS ?= 1
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -61,6 +63,7 @@ $(VENV)/.torch: $(VENV)/.python
 
 $(VENV)/.installed: $(VENV)/.torch setup.py pyproject.toml package.xml
 	$(PIP) install --quiet --editable ".[$(EXTRAS)]"
+	[[ -z "$(ROS)" ]] || PIP="$(PIP)" tools/install_ros.sh
 	touch $@
 
 $(VENV)/.weights: $(VENV)/.installed $(wildcard thegra_core/features/weights.py)

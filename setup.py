@@ -49,6 +49,8 @@ EXTRAS = {
         "ros-jazzy-rmw-fastrtps-cpp",
     ],
 }
+NODES = ("slam", "preprocessing", "frontend", "tracking", "mapping")
+"""Executables that `ros2 run thegra_ros` finds."""
 
 
 def tree(target: str, folder: str, patterns: tuple[str, ...]) -> list[tuple[str, list[str]]]:
@@ -83,5 +85,8 @@ setup(
     zip_safe=False,
     install_requires=REQUIRES,
     extras_require=EXTRAS,
-    entry_points={"console_scripts": ["thegra = thegra_core.cli.main:main"]},
+    entry_points={
+        "console_scripts": ["thegra = thegra_core.cli.main:main", *(f"{name} = thegra_ros.nodes.{name}:main" for name in NODES)],
+        "thegra.commands": ["live = thegra_ros.commands:live", "play = thegra_ros.commands:play"],
+    },
 )

@@ -19,7 +19,19 @@ from thegra_core.features.registry import make_extractor, make_matcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
-from thegra_core.messages import Features, Frame, FrameRecord, MapUpdate, Run, Shutter, ShutterState, Snapshot, TrackingResult, TrackingState
+from thegra_core.messages import (
+    Features,
+    Frame,
+    FrameRecord,
+    MapSummary,
+    MapUpdate,
+    Run,
+    Shutter,
+    ShutterState,
+    Snapshot,
+    TrackingResult,
+    TrackingState,
+)
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
 from thegra_core.snapshots import SnapshotKeeper
@@ -145,10 +157,12 @@ class Slam:
 
     def current_map(self) -> tuple[FloatArray, FloatArray]:
         """Keyframe poses (K, 4, 4) and landmarks (L, 3) of the map being tracked, for viewers; empty before the first map."""
-        if self._tracking.map_id < 0:
-            return np.empty((0, 4, 4)), np.empty((0, 3))
-        summary = self._mapper.summary(self._tracking.map_id)
-        return summary.keyframe_poses, summary.points_world
+        summary = self.current_summary()
+        return (summary.keyframe_poses, summary.points_world) if summary is not None else (np.empty((0, 4, 4)), np.empty((0, 3)))
+
+    def current_summary(self) -> MapSummary | None:
+        """A copy of what the map being tracked holds; None before the first map."""
+        return self._mapper.summary(self._tracking.map_id) if self._tracking.map_id >= 0 else None
 
     def finish(self, progress: Callable[[str], None] | None = None) -> Run:
         """Full bundle adjustment, late localisation of frames without a pose, and the account of the run."""

@@ -1,0 +1,56 @@
+"""ROS 2 for tests: a graph of one's own, and a recording to play in it."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import os
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from thegra_core.messages import Frame
+from thegra_core.simulation.demo import make_demo_bag, thermal_camera
+from thegra_core.sources.open import open_recording
+
+if TYPE_CHECKING:
+    from ros_graph import Graph
+
+    from thegra_core.geometry.camera import CameraModel
+
+if importlib.util.find_spec("rclpy") is not None:
+    with warnings.catch_warnings():  # its parser imports a module that Python has deprecated
+        warnings.simplefilter("ignore", DeprecationWarning)
+        import rosidl_generator_py  # noqa: F401
+
+_domains = itertools.count(os.getpid())
+
+
+@pytest.fixture(scope="session")
+def recording_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_demo_bag(tmp_path_factory.mktemp("demo") / "bag", duration_s=3.0)
+
+
+@pytest.fixture(scope="session")
+def frames(recording_path: Path) -> list[Frame]:
+    return list(open_recording(recording_path).frames())
+
+
+@pytest.fixture(scope="session")
+def camera() -> CameraModel:
+    return thermal_camera()
+
+
+@pytest.fixture
+def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
+    from ros_graph import Graph
+
+    domain = 1 + next(_domains) % 100  # beyond 101 the ports meet those that Linux gives away
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
+    made = Graph(domain, tmp_path)
+    yield made
+    made.close()

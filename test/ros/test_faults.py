@@ -1,0 +1,168 @@
+"""What goes wrong in the field does not end the node, and is said."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ros]")
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from rcl_interfaces.srv import SetParameters
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_graph import NAMESPACE, Graph, set_parameter
+from sensor_msgs.msg import Image
+
+from thegra_core.geometry.camera import CameraModel
+from thegra_ros.transforms import UNKNOWN_VARIANCE
+
+
+@pytest.mark.slow
+def test_bad_input_is_said_and_survived(graph: Graph, frames, camera: CameraModel) -> None:
+    node = graph.start()
+    graph.wait_for_listener()
+
+    graph.send(frames[:2])  # before camera_info
+    graph.wait(lambda: graph.value("bad: image without a camera") == "2")
+    graph.wait(lambda: graph.heard(DiagnosticStatus.ERROR, "no camera_info on /thegra/camera_info"))
+
+    graph.send_camera(replace_matrix(camera, 0.0))  # K of a driver without a calibration
+    graph.wait(lambda: graph.heard(DiagnosticStatus.ERROR, "not calibrated"))
+    assert graph.heard(DiagnosticStatus.ERROR, "camera_file")
+
+    graph.send_camera(camera)
+    graph.send(frames[2:4], encoding="bayer_rggb8")
+    graph.wait(lambda: graph.value("bad: unknown encoding 'bayer_rggb8'") == "2")
+
+    graph.send(frames[4:14])
+    graph.wait(lambda: graph.processed() == 10)
+    small = [replace(frame, image=frame.image[:128]) for frame in frames[14:16]]  # the driver changes its mode
+    graph.send(small)
+    graph.wait(lambda: graph.processed() == 12)
+    assert graph.heard(DiagnosticStatus.WARN, "size") or graph.heard(DiagnosticStatus.ERROR, "size")
+    before = len(graph.received["pose"])
+
+    cropped = CameraModel(camera.matrix, camera.distortion, camera.model, (320, 128), camera.name)
+    graph.send_camera(cropped)
+    graph.send([replace(frame, image=frame.image[:128]) for frame in frames[16:]])
+    graph.wait(lambda: graph.processed() == 12 + len(frames[16:]))
+    assert "a new map begins" in node.output and "320x128" in node.output
+    assert len(graph.received["pose"]) >= before
+    assert node.end() == 0
+
+
+def replace_matrix(camera: CameraModel, factor: float) -> CameraModel:
+    made = CameraModel(camera.matrix, camera.distortion, camera.model, camera.image_size, camera.name)
+    object.__setattr__(made, "matrix", camera.matrix * factor)  # the model itself refuses such a matrix
+    return made
+
+
+@pytest.mark.slow
+def test_a_closed_shutter_puts_nothing_on_pose(graph: Graph, frames, camera) -> None:
+    node = graph.start()
+    graph.wait_for_listener()
+    graph.send_camera(camera)
+    closed = [replace(frame, image=np.full_like(frame.image, 7000)) for frame in frames[16:19]]
+    graph.send([*frames[:16], *closed])
+    graph.wait(lambda: graph.processed() == 19)
+    assert graph.heard(DiagnosticStatus.WARN, "prediction")
+    stamps = {frame.stamp_ns for frame in closed}
+    claimed = {m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in graph.received["pose"]}
+    assert claimed and not claimed & stamps
+    predicted = [m for m in graph.received["odometry"] if m.header.stamp.sec * 10**9 + m.header.stamp.nanosec in stamps]
+    assert len(predicted) == 3 and all(m.pose.covariance[0] >= UNKNOWN_VARIANCE for m in predicted)
+    assert node.end() == 0
+
+
+@pytest.mark.slow
+def test_lifecycle_requests_that_are_invalid_end_nothing(graph: Graph, frames, camera) -> None:
+    node = graph.start(parameters={"autostart": "false"})
+    assert graph.state() == "unconfigured"
+    assert not graph.change_state(Transition.TRANSITION_ACTIVATE), "not before it is configured"
+    assert not graph.change_state(99)
+    assert graph.state() == "unconfigured"
+    for _ in range(2):
+        assert graph.change_state(Transition.TRANSITION_CONFIGURE)
+        refused = graph.call(SetParameters, "slam/set_parameters", SetParameters.Request(parameters=[set_parameter("keyframe.rotation_deg", 5.0)]))
+        assert not refused.results[0].successful and "clean it up" in refused.results[0].reason
+        assert graph.change_state(Transition.TRANSITION_ACTIVATE)
+        graph.wait_for_listener()
+        graph.send_camera(camera)
+        before = len(graph.received["pose"])
+        graph.send(frames[:12])
+        graph.wait(lambda: graph.processed() == 12)
+        assert len(graph.received["pose"]) > before
+        assert graph.change_state(Transition.TRANSITION_DEACTIVATE)
+        assert graph.change_state(Transition.TRANSITION_CLEANUP)
+        graph.received["/diagnostics"].clear()
+    out_of_range = graph.call(SetParameters, "slam/set_parameters", SetParameters.Request(parameters=[set_parameter("extractor.max_keypoints", 1)]))
+    assert not out_of_range.results[0].successful
+    accepted = graph.call(SetParameters, "slam/set_parameters", SetParameters.Request(parameters=[set_parameter("keyframe.rotation_deg", 5.0)]))
+    assert accepted.results[0].successful
+    assert graph.change_state(Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
+    assert node.end() == 0
+
+
+def test_a_transition_that_fails_says_why(graph: Graph, tmp_path) -> None:
+    node = graph.start(parameters={"autostart": "false", "camera_file": str(tmp_path / "none.yaml")})
+    assert not graph.change_state(Transition.TRANSITION_CONFIGURE)
+    assert graph.state() == "unconfigured"
+    assert "none.yaml" in node.output
+    assert node.end() == 0
+
+
+@pytest.mark.slow
+def test_sigterm_during_work(graph: Graph, frames, camera) -> None:
+    node = graph.start()
+    graph.wait_for_listener()
+    graph.send_camera(camera)
+    graph.send(frames)
+    graph.wait(lambda: graph.processed() >= 1)
+    assert graph.processed() < len(frames), "there is work left"
+    assert node.end(signal.SIGTERM) == 0
+
+
+@pytest.mark.slow
+def test_the_engine_is_started_again_when_it_dies(graph: Graph, frames, camera) -> None:
+    node = graph.start()
+    graph.wait_for_listener()
+    graph.send_camera(camera)
+    graph.send(frames[:12])
+    graph.wait(lambda: graph.processed() == 12)
+    (engine,) = children(node.process.pid)
+    os.kill(engine, signal.SIGKILL)
+    before = len(graph.received["pose"])
+    graph.send(frames[12:13])  # the one that meets the dead engine
+    graph.wait(lambda: "a new map begins" in node.output, "a word about the engine")
+    assert "out of memory" in node.output
+    graph.send(frames[13:])
+    graph.wait(lambda: len(graph.received["pose"]) > before, "poses of a new map")
+    assert node.end() == 0
+
+
+def children(pid: int) -> list[int]:
+    """Processes whose parent this is and that run the engine."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((folder / "stat").read_text().rsplit(")", 1)[1].split()[1])
+            if parent == pid and "spawn_main" in (folder / "cmdline").read_text():
+                found.append(int(folder.name))
+        except (OSError, ValueError):  # it has ended
+            continue
+    return found
+
+
+def test_ends_that_do_not_fit_are_told(graph: Graph) -> None:
+    """A node that asks for reliable images, and a driver that sends best effort."""
+    node = graph.start(parameters={f"qos_overrides.{NAMESPACE}/image_raw.subscription.reliability": "reliable"})
+    graph.node.create_publisher(Image, "image_raw", QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
+    graph.wait(lambda: "no data between" in node.output, "a word about the misfit")
+    assert f"qos_overrides.{NAMESPACE}/image_raw.subscription.reliability" in node.output
+    assert node.end() == 0

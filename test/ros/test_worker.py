@@ -1,0 +1,130 @@
+"""The thread between the queue and the engine."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from thegra_core.config import load_config
+from thegra_core.errors import WeightsError
+from thegra_core.messages import Frame, TrackingResult, TrackingState
+from thegra_core.simulation.demo import thermal_camera
+from thegra_ros.engine import Done, EngineError, Job, LocalEngine
+from thegra_ros.worker import MOST_FAILURES, Worker
+
+LIMIT_S = 60
+
+
+class FakeEngine:
+    """Fails where it is told to."""
+
+    def __init__(self, start: Exception | None = None, process: list[Exception | None] | None = None) -> None:
+        self.failure, self.answers = start, list(process or [])
+        self.stopped = 0
+
+    def start(self) -> None:
+        if self.failure is not None:
+            raise self.failure
+
+    def process(self, job: Job) -> Done:
+        failure = self.answers.pop(0) if self.answers else None
+        if failure is not None:
+            raise failure
+        return Done(TrackingResult(job.frame.stamp_ns, TrackingState.LOST))
+
+    def stop(self) -> None:
+        self.stopped += 1
+
+
+class Harness:
+    """A worker over engines made in advance; what it said and did."""
+
+    def __init__(self, *engines: FakeEngine) -> None:
+        self.engines, self.made = list(engines), 0
+        self.done: list[int] = []
+        self.failures: list[tuple[str, bool]] = []
+        self.changed = threading.Condition()
+        self.worker: Worker[int] = Worker(self._make, 100, self._job, self._on_done, self._on_failure)
+        self.worker.start()
+
+    def _make(self) -> FakeEngine:
+        self.made += 1
+        return self.engines[self.made - 1]
+
+    def _job(self, item: int) -> Job:
+        return Job(Frame(item, item, np.zeros((2, 2), np.uint8)), thermal_camera((2, 2)), 0)
+
+    def _on_done(self, item: int, done: Done, ms: float) -> None:
+        with self.changed:
+            self.done.append(done.result.stamp_ns)
+            self.changed.notify_all()
+
+    def _on_failure(self, text: str, final: bool) -> None:
+        with self.changed:
+            self.failures.append((text, final))
+            self.changed.notify_all()
+
+    def wait(self, condition) -> None:
+        with self.changed:
+            assert self.changed.wait_for(condition, LIMIT_S)
+
+
+def test_items_are_worked_on_in_order() -> None:
+    harness = Harness(FakeEngine())
+    for item in range(5):
+        harness.worker.queue.put(item)
+    harness.wait(lambda: harness.done == [0, 1, 2, 3, 4])
+    harness.worker.stop()
+    assert harness.failures == [] and harness.engines[0].stopped
+
+
+@pytest.mark.parametrize("failure", [EngineError("killed"), RuntimeError("a fault")])
+def test_a_failed_engine_is_replaced(failure: Exception) -> None:
+    harness = Harness(FakeEngine(process=[None, failure]), FakeEngine())
+    for item in range(4):
+        harness.worker.queue.put(item)
+    harness.wait(lambda: harness.done == [0, 2, 3])
+    harness.worker.stop()
+    assert harness.made == 2 and len(harness.failures) == 1 and str(failure) in harness.failures[0][0] and not harness.failures[0][1]
+
+
+def test_an_engine_that_never_works_is_given_up() -> None:
+    harness = Harness(*[FakeEngine(start=EngineError("no")) for _ in range(MOST_FAILURES + 1)])
+    harness.wait(lambda: len(harness.failures) == MOST_FAILURES)
+    harness.worker.stop()
+    assert [final for _, final in harness.failures] == [False] * (MOST_FAILURES - 1) + [True]
+    assert harness.made == MOST_FAILURES
+
+
+def test_what_the_user_must_put_right_is_not_tried_again() -> None:
+    harness = Harness(FakeEngine(start=WeightsError("fetch them")))
+    harness.wait(lambda: bool(harness.failures))
+    harness.worker.stop()
+    assert harness.failures == [("fetch them", True)] and harness.made == 1
+
+
+def test_another_epoch_begins_a_new_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[object] = []
+
+    class FakeSlam:
+        def __init__(self, camera, config, *networks) -> None:
+            made.append(networks)
+
+        def process(self, frame: Frame) -> TrackingResult:
+            if frame.index == 9:
+                raise ZeroDivisionError
+            return TrackingResult(frame.stamp_ns, TrackingState.INITIALIZING)
+
+    monkeypatch.setattr("thegra_core.slam.Slam", FakeSlam)
+    engine = LocalEngine(load_config("fast", overrides={"extractor.name": "orb"}))
+    engine.start()
+    camera = thermal_camera((2, 2))
+    for index, epoch in ((0, 0), (1, 0), (2, 1), (3, 1)):
+        engine.process(Job(Frame(index, index, np.zeros((2, 2), np.uint8)), camera, epoch))
+    assert len(made) == 2 and made[0][0] is made[1][0], "the networks stay"
+    with pytest.raises(EngineError, match="ZeroDivisionError"):
+        engine.process(Job(Frame(9, 9, np.zeros((2, 2), np.uint8)), camera, 1))
+    engine.process(Job(Frame(10, 10, np.zeros((2, 2), np.uint8)), camera, 1))
+    assert len(made) == 3, "what failed may be in any state"

@@ -1,0 +1,59 @@
+"""Where the camera's calibration comes from: a file, or camera_info; and what is said while there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sensor_msgs.msg import CameraInfo
+
+from thegra_core.errors import CalibrationError
+from thegra_core.geometry.camera import CameraModel
+from thegra_core.sources.calibration import camera_from_info, load_camera
+from thegra_ros.diagnostics import Health
+from thegra_ros.lifecycle import ManagedNode
+from thegra_ros.qos import SENSOR
+
+COMPLAINT_PERIOD_S = 5.0
+
+
+class CameraInput:
+    """Holds the camera model; `on_change` is called with the reason when another one replaces it.
+
+    Raises:
+        CalibrationError: If the file cannot be used.
+    """
+
+    def __init__(self, node: ManagedNode, file: str, health: Health, on_change: Callable[[str], None]) -> None:
+        self._node, self._health = node, health
+        self._on_change = on_change
+        self._seen: tuple[object, ...] | None = None
+        self._topic = node.resolve_topic_name("camera_info")
+        self.camera: CameraModel | None = load_camera(Path(file).expanduser()) if file else None
+        self._health.camera_trouble = "" if self.camera else f"no camera_info on {self._topic} yet: remap camera_info to your driver's topic, or give the parameter camera_file"
+        if self.camera is None:
+            node.listen(CameraInfo, "camera_info", SENSOR, self._on_info)
+        node.every(COMPLAINT_PERIOD_S, self._complain)
+
+    def _on_info(self, info: CameraInfo) -> None:
+        seen = (tuple(info.k), tuple(info.d), info.distortion_model, info.width, info.height)
+        if seen == self._seen:
+            return
+        self._seen = seen
+        try:
+            camera = camera_from_info(info)
+            self._health.camera_trouble = "" if camera else f"{self._topic} says that the camera is not calibrated (its K is zero): calibrate it, and give the parameter camera_file"
+        except CalibrationError as error:
+            camera, self._health.camera_trouble = None, f"{self._topic} cannot be used: {error}"
+        before, self.camera = self.camera, camera
+        if camera is None:
+            return
+        what = f"{camera.image_size[0]}x{camera.image_size[1]}, {camera.model.value}, focal length {camera.focal:.1f} px"
+        if before is not None:
+            self._on_change(f"{self._topic} changed to {what}")
+        else:
+            self._node.get_logger().info(f"camera {what}, from {self._topic}")
+
+    def _complain(self) -> None:
+        if self._health.camera_trouble and self._node.active:
+            self._node.get_logger().warning(self._health.camera_trouble)

@@ -1,0 +1,1 @@
+"""Thegra's messages as standard ROS messages and back: no number is rounded on the way."""

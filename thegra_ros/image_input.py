@@ -1,0 +1,58 @@
+"""Images as frames: decoded, counted, and watched for a stream that begins anew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.duration import Duration
+from sensor_msgs.msg import CompressedImage, Image
+
+from thegra_core.messages import Frame
+from thegra_core.sources.image_decoding import DecodeError
+from thegra_ros.codec.images import frame_from_image
+from thegra_ros.diagnostics import Health
+from thegra_ros.lifecycle import ManagedNode
+from thegra_ros.qos import SENSOR
+from thegra_ros.stamp_watch import StampWatch
+
+
+class ImageInput:
+    """Calls `on_frame` with each frame and its frame_id while the node is active, and `on_restart` with the reason when time goes back."""
+
+    def __init__(self, node: ManagedNode, transport: str, health: Health, on_frame: Callable[[Frame, str], None], on_restart: Callable[[str], None]) -> None:
+        self._node, self._health, self._on_frame, self._on_restart = node, health, on_frame, on_restart
+        self._stamps, self._index = StampWatch(), 0
+        raw = transport == "raw"
+        node.listen(Image if raw else CompressedImage, "image_raw" if raw else "image_raw/compressed", SENSOR, self._on_image)
+        backwards = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+        self._jumps = node.get_clock().create_jump_callback(backwards, post_callback=self._on_jump)
+
+    def forget(self) -> None:
+        """Take the next stamp as the first."""
+        self._stamps.forget()
+
+    def close(self) -> None:
+        """Stop watching the clock."""
+        self._jumps.unregister()
+
+    def _on_image(self, message: Image | CompressedImage) -> None:
+        if not self._node.active:
+            return
+        self._health.image_came()
+        if self._health.paused:
+            return
+        try:
+            frame = frame_from_image(message, self._index)
+        except DecodeError as error:
+            self._health.bad[str(error)] += 1
+            self._node.get_logger().warning(f"image not used: {error}", throttle_duration_sec=5.0)
+            return
+        self._index += 1
+        if self._stamps.begins_anew(frame.stamp_ns):
+            self._on_restart("the images' stamps went back, as those of a bag that loops do")
+        self._on_frame(frame, message.header.frame_id)
+
+    def _on_jump(self, jump: TimeJump) -> None:
+        if jump.delta.nanoseconds < 0:
+            self._on_restart(f"time went back by {-jump.delta.nanoseconds / 1e9:.1f} s")

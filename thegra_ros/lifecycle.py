@@ -1,0 +1,175 @@
+"""Base of the nodes: a lifecycle node that starts itself, refuses invalid requests instead of dying of them, and says why a transition failed."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from thegra_core.errors import ThegraError
+from thegra_ros.qos import publisher_options, subscription_options
+
+
+class ManagedNode(LifecycleNode):
+    """Derived nodes override `configure`, `activate`, `deactivate` and `release`.
+
+    A ThegraError they raise is logged as one message and the transition fails; anything else is logged with its traceback. Publishers, subscriptions,
+    timers and services made through `publisher`, `listen`, `serve` and `every` are removed when the node is cleaned up.
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, **options)
+        self.active = False
+        self._mine: list[tuple[Callable[[Any], Any], Any]] = []
+        self._guard_transitions()
+        self._autostart = bool(self.declare_parameter("autostart", True, ParameterDescriptor(description="configure and activate the node when it starts")).value)
+
+    def configure(self) -> None:
+        """Read the parameters and make what is needed."""
+
+    def activate(self) -> None:
+        """Begin to work."""
+
+    def deactivate(self) -> None:
+        """Stop working; what is known is kept."""
+
+    def release(self) -> None:
+        """Undo `configure`, also a half-done one."""
+
+    def start(self) -> bool:
+        """Configure and activate if the parameter `autostart` says so; False: it was tried and failed."""
+        if not self._autostart:
+            return True
+        done = TransitionCallbackReturn.SUCCESS
+        return self.trigger_configure() == done and self.trigger_activate() == done
+
+    # ---- entities -------------------------------------------------------------------------------------------------------------------
+
+    def publisher(self, kind: type, topic: str, qos: Any, always: bool = False) -> Any:
+        """A publisher that is silent unless the node is active, or `always` speaks."""
+        make, destroy = (self.create_publisher, self.destroy_publisher) if always else (self.create_lifecycle_publisher, self.destroy_lifecycle_publisher)
+        made = make(kind, topic, qos, **publisher_options(self, topic))
+        self._mine.append((destroy, made))
+        return made
+
+    def listen(self, kind: type, topic: str, qos: Any, callback: Callable[[Any], None]) -> Any:
+        """A subscription."""
+        made = self.create_subscription(kind, topic, callback, qos, **subscription_options(self, topic))
+        self._mine.append((self.destroy_subscription, made))
+        return made
+
+    def serve(self, kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:
+        """A service."""
+        self._mine.append((self.destroy_service, self.create_service(kind, name, callback)))
+
+    def every(self, period_s: float, callback: Callable[[], None]) -> None:
+        """A timer of the machine's time, whatever simulated time does."""
+        clock = rclpy.clock.Clock(clock_type=rclpy.clock.ClockType.STEADY_TIME)
+        self._mine.append((self.destroy_timer, self.create_timer(period_s, callback, clock=clock)))
+
+    # ---- transitions ----------------------------------------------------------------------------------------------------------------
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        result = self._try(self.configure, lambda: super(ManagedNode, self).on_configure(state))
+        if result != TransitionCallbackReturn.SUCCESS:
+            self._undo()
+        return result
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        result = self._try(lambda: super(ManagedNode, self).on_activate(state), self.activate)
+        self.active = result == TransitionCallbackReturn.SUCCESS
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.active = False
+        return self._try(self.deactivate, lambda: super(ManagedNode, self).on_deactivate(state))
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._try(self._undo)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.active = False
+        return self._try(self._undo)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.active = False
+        return self._try(self._undo)
+
+    def end(self) -> None:
+        """Release everything when the process ends, whatever state the node is in."""
+        self.active = False
+        self._try(self._undo)
+
+    def _undo(self) -> None:
+        self.release()
+        for destroy, entity in reversed(self._mine):
+            destroy(entity)
+        self._mine.clear()
+
+    def _try(self, *steps: Callable[[], Any]) -> TransitionCallbackReturn:
+        # rclpy takes any exception in a transition for an error and says nothing of it
+        try:
+            results = [step() for step in steps]
+        except ThegraError as error:
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        except Exception:
+            self.get_logger().error(f"transition failed:\n{traceback.format_exc()}")
+            return TransitionCallbackReturn.ERROR
+        return next((r for r in results if isinstance(r, TransitionCallbackReturn) and r != TransitionCallbackReturn.SUCCESS), TransitionCallbackReturn.SUCCESS)
+
+    def _guard_transitions(self) -> None:
+        # a request that is invalid in the present state raises out of spin() and would end the node
+        for service in self.services:
+            if service.srv_name.endswith("/change_state"):
+                service.callback = self._guarded(service.callback)
+
+    def _guarded(self, change_state: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        def guard(request: Any, response: Any) -> Any:
+            try:
+                return change_state(request, response)
+            except Exception as error:  # RCLError is no public class
+                self.get_logger().warning(f"transition {request.transition.label or request.transition.id} refused: {error}")
+                response.success = False
+                return response
+
+        return guard
+
+
+def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = None) -> int:
+    """Run a node until it is told to end (SIGINT, SIGTERM); the exit code: 0, or 2 if it could not start."""
+    try:
+        rclpy.init(args=arguments)
+    except Exception as error:  # RCLError is no public class
+        sys.stderr.write(f"thegra: ROS arguments not understood: {error}\n")
+        return 2
+    node: ManagedNode | None = None
+    executor = SingleThreadedExecutor()
+    try:
+        node = make()
+        executor.add_node(node)
+        if not node.start():
+            return 2 if rclpy.ok() else 0
+        executor.spin()
+    except ThegraError as error:
+        rclpy.logging.get_logger("thegra").error(str(error))
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    except Exception:
+        if rclpy.ok():
+            raise
+        return 0  # told to end while it was still being made
+    finally:
+        if node is not None:
+            node.end()
+            executor.remove_node(node)
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0

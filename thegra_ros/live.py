@@ -1,0 +1,60 @@
+"""`thegra live`: the node without a launch system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from thegra_core.errors import ConfigError
+from thegra_core.process import keep_freed_memory
+from thegra_ros.environment import use_large_segments
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """The command's options; None: not given. `extra` goes to ROS as it is."""
+
+    image: str | None = None
+    camera: Path | None = None
+    profile: str | None = None
+    config: Path | None = None
+    namespace: str = "thegra"
+    extra: tuple[str, ...] = ()
+
+
+def live(options: LiveOptions) -> int:
+    """Run until told to end; the exit code.
+
+    Raises:
+        ConfigError: If a file does not exist or the arguments are not understood.
+    """
+    arguments = ros_arguments(options)
+    use_large_segments()
+    keep_freed_memory()
+    from thegra_ros.lifecycle import run_node
+    from thegra_ros.nodes.slam import SlamNode
+
+    return run_node(SlamNode, arguments)
+
+
+def ros_arguments(options: LiveOptions) -> list[str]:
+    """The options as ROS arguments; the user's own come first, which is what wins among remappings.
+
+    Raises:
+        ConfigError: If a file does not exist, or an argument is neither the command's nor behind --ros-args.
+    """
+    extra = list(options.extra)
+    if extra and extra[0] != "--ros-args":
+        raise ConfigError(f"{extra[0]} is not understood: see thegra live --help; what is for ROS goes behind --ros-args")
+    arguments = [*(extra or ["--ros-args"]), "-r", f"__ns:=/{options.namespace.strip('/')}"]
+    if options.image is not None:
+        topic = "/" + options.image.strip("/")
+        arguments += ["-r", f"image_raw:={topic}", "-r", f"camera_info:={topic.rsplit('/', 1)[0]}/camera_info"]
+    for name, file in (("camera_file", options.camera), ("config_file", options.config)):
+        if file is not None:
+            if not file.is_file():
+                raise ConfigError(f"{file} does not exist")
+            arguments += ["-p", f"{name}:={file.resolve()}"]
+    if options.profile is not None:
+        arguments += ["-p", f"profile:={options.profile}"]
+    return arguments

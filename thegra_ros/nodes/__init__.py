@@ -1,0 +1,1 @@
+"""The nodes; each module's `main` is an executable."""

@@ -1,0 +1,81 @@
+"""Images in; pre-processed images and the shutter's state out. The node to run beside the camera where the rest runs elsewhere."""
+
+from __future__ import annotations
+
+import sys
+
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import Image
+
+from thegra_core.messages import Frame, Shutter
+from thegra_core.preprocessing.chain import Chain
+from thegra_core.preprocessing.shutter import ShutterDetector
+from thegra_ros.codec.images import image_message
+from thegra_ros.codec.shutter import FrameNotice, notice_message
+from thegra_ros.codec.stamps import header
+from thegra_ros.image_input import ImageInput
+from thegra_ros.lifecycle import run_node
+from thegra_ros.qos import LOSSLESS, STREAM
+from thegra_ros.stage_node import StageNode
+
+
+class PreprocessingNode(StageNode):
+    """The first stage."""
+
+    def __init__(self) -> None:
+        super().__init__("preprocessing")
+        self._input: ImageInput | None = None
+
+    def prepare(self) -> None:
+        self._images = self.publisher(Image, "image_preprocessed", STREAM)
+        self._notices = self.publisher(DiagnosticArray, "shutter", LOSSLESS)
+        self._epoch = 0
+        self._fresh()
+        self._input = ImageInput(self, self.own.image_transport, self.health, lambda frame, frame_id: self.enqueue((frame, frame_id)), self._restart)
+
+    def release(self) -> None:
+        if self._input is not None:
+            self._input.close()
+        self._input = None
+        super().release()
+
+    def work(self, item: tuple[Frame | None, str]) -> None:
+        frame, frame_id = item
+        if frame is None:
+            self._fresh()
+            return
+        if self._last_ns is not None and frame.stamp_ns <= self._last_ns:
+            self.health.bad["stamp repeats or goes back"] += 1
+            return
+        self._last_ns = frame.stamp_ns
+        state = self._shutter.update(frame)
+        if state.recalibrated:
+            self._chain.reset()
+        self._notices.publish(notice_message(FrameNotice(state, self._epoch, frame_id)))
+        if state.shutter is not Shutter.CLOSED:
+            self._images.publish(image_message(header(frame.stamp_ns, frame_id), self._chain(frame.image, frame.stamp_ns)))
+
+    def begin_anew(self, why: str) -> None:
+        self._fresh()
+
+    def _restart(self, why: str) -> None:
+        """In the order of the images: what waits is of the old run."""
+        if self._input is not None:
+            self._input.forget()
+        if self.queue is not None:
+            self.queue.clear()
+        self.enqueue((None, ""))
+        self.get_logger().info(f"the stream begins anew: {why}")
+
+    def _fresh(self) -> None:
+        self._epoch += 1
+        self._chain, self._shutter, self._last_ns = Chain(self.config.preprocessing), ShutterDetector(self.config.preprocessing.shutter), None
+
+
+def main() -> None:
+    """The executable `preprocessing`."""
+    sys.exit(run_node(PreprocessingNode))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""Base of the nodes of single stages: parameters, diagnostics, and a thread that works on what the callbacks enqueue."""
+
+from __future__ import annotations
+
+import threading
+import traceback
+from typing import Any
+
+from thegra_core.errors import ThegraError
+from thegra_core.process import keep_freed_memory, set_threads
+from thegra_ros.diagnostics import Health, Reporter
+from thegra_ros.frame_queue import LatestQueue
+from thegra_ros.lifecycle import ManagedNode
+from thegra_ros.node_parameters import NodeParameters
+
+EVERYTHING = 10**6
+"""Size of a queue that drops nothing."""
+
+
+class StageNode(ManagedNode):
+    """Derived nodes override `prepare` (topics), `load` (networks, in the thread), `work` (one item, in the thread) and `begin_anew`."""
+
+    queue_size = 0  # 0: as the parameter says
+
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, **options)
+        keep_freed_memory()
+        self._settings = NodeParameters(self)
+        self.queue: LatestQueue[Any] | None = None
+        self._thread: threading.Thread | None = None
+        self.stopping = threading.Event()
+
+    def prepare(self) -> None:
+        """Make publishers and subscriptions."""
+
+    def load(self) -> None:
+        """Load what takes time; nothing is worked on before."""
+
+    def work(self, item: Any) -> None:
+        """Work on an item."""
+
+    def begin_anew(self, why: str) -> None:
+        """Forget what was known of the stream."""
+
+    def facts(self) -> dict[str, object]:
+        """What the diagnostics say besides."""
+        return {}
+
+    def enqueue(self, item: Any) -> None:
+        """Hand an item to the thread."""
+        if self.active and self.queue is not None:
+            self.queue.put(item)
+
+    def configure(self) -> None:
+        self.config, self.own = self._settings.read()
+        set_threads(self.config.threads)
+        self.health = Health()
+        self.reporter = Reporter(self, self.health, lambda: {"dropped": self.queue.dropped if self.queue is not None else 0, **self.facts()})
+        self.queue = LatestQueue(self.queue_size or self.own.queue_size)
+        self.stopping.clear()
+        self.prepare()
+        self._thread = threading.Thread(target=self._run, args=(self.queue,), name="thegra stage", daemon=True)
+        self._thread.start()
+        self._settings.configured = True
+
+    def release(self) -> None:
+        self.stopping.set()
+        if self.queue is not None:
+            self.queue.close()
+        if self._thread is not None:
+            self._thread.join()
+        self.queue = self._thread = None
+        self._settings.configured = False
+
+    def _run(self, queue: LatestQueue[Any]) -> None:
+        try:
+            self.load()
+        except ThegraError as error:
+            self._tell(str(error))
+            return
+        while (item := queue.get()) is not None:
+            if not self.active:
+                continue
+            try:
+                self.work(item)
+                self.health.done += 1
+            except Exception as error:  # a thread that ends without a word would be a node that does nothing
+                if self.stopping.is_set() or not self.context.ok():
+                    return
+                self._tell(str(error) if isinstance(error, ThegraError) else traceback.format_exc())
+                self.begin_anew("the stage failed")
+
+    def _tell(self, text: str) -> None:
+        self.get_logger().error(text)
+        self.health.trouble = text.strip().splitlines()[-1]
+        self.reporter.report()

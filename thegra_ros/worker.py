@@ -1,0 +1,76 @@
+"""The thread that hands frames to the engine and results on, and begins anew when the engine fails."""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from thegra_core.errors import ThegraError
+from thegra_ros.engine import Done, Engine, EngineError, Job
+from thegra_ros.frame_queue import LatestQueue
+
+MOST_FAILURES = 3
+"""In a row; then the engine is given up."""
+T = TypeVar("T")
+
+
+class Worker(Generic[T]):
+    """Takes items from a bounded queue; `to_job` makes a job of one when its turn comes.
+
+    `on_done` gets item, result and milliseconds; `on_failure` a text, and whether that is the end. Both are called from the thread. `is_alive` is False
+    once the process is told to end: then failures are no news.
+    """
+
+    def __init__(
+        self, make_engine: Callable[[], Engine], queue_size: int, to_job: Callable[[T], Job], on_done: Callable[[T, Done, float], None],
+        on_failure: Callable[[str, bool], None], is_alive: Callable[[], bool] = lambda: True,
+    ) -> None:  # fmt: skip
+        self._make_engine, self._to_job, self._on_done, self._on_failure, self._is_alive = make_engine, to_job, on_done, on_failure, is_alive
+        self.queue: LatestQueue[T] = LatestQueue(queue_size)
+        self._engine: Engine | None = None
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="thegra worker", daemon=True)
+
+    def start(self) -> None:
+        """Load the networks and begin to work, without waiting for either."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, giving up the frame in work; waits until it has ended."""
+        self._stopping = True
+        self.queue.close()
+        if self._engine is not None:
+            self._engine.stop()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        failures = 0
+        while failures < MOST_FAILURES and not self._stopping:
+            try:
+                self._work()
+                return
+            except ThegraError as error:  # something the user has to put right first
+                self._on_failure(str(error), True)
+                return
+            except Exception as error:  # a thread that ends without a word would be a node that does nothing
+                if self._stopping or not self._is_alive():
+                    return
+                failures = failures + 1 if self._engine_worked == 0 else 1
+                self._on_failure(str(error) if isinstance(error, EngineError) else traceback.format_exc(), failures == MOST_FAILURES)
+            finally:
+                if self._engine is not None:
+                    self._engine.stop()
+
+    def _work(self) -> None:
+        self._engine_worked = 0
+        self._engine = self._make_engine()
+        self._engine.start()
+        while (item := self.queue.get()) is not None:
+            begin = time.monotonic()
+            done = self._engine.process(self._to_job(item))
+            self._engine_worked += 1
+            self._on_done(item, done, 1e3 * (time.monotonic() - begin))
