@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from thegra_core.simulation.demo import make_demo_bag, thermal_camera
 
 from thegra_core.messages import Frame
-from thegra_core.simulation.demo import make_demo_bag, thermal_camera
 from thegra_core.sources.open import open_recording
 
 if TYPE_CHECKING:
