@@ -27,6 +27,7 @@ def live(
     profile: Annotated[str | None, typer.Option(help="paper, quality or fast. Default: quality.")] = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with parameters; a run's config.yaml will do.")] = None,
     namespace: Annotated[str, typer.Option(help="Namespace of nodes and topics.")] = "thegra",
+    single_process: Annotated[bool, typer.Option("--single-process/--stages", help="One node for the whole system, or one for each of its four stages.")] = True,
 ) -> None:
     """Track a live camera: images on a ROS 2 topic in, pose, path and map out.
 
@@ -38,7 +39,7 @@ def live(
     from thegra_ros.live import LiveOptions
     from thegra_ros.live import live as run
 
-    raise typer.Exit(run(LiveOptions(image, camera, profile, config, namespace, tuple(context.args))))
+    raise typer.Exit(run(LiveOptions(image, camera, profile, config, namespace, tuple(context.args), single_process)))
 
 
 def play(

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from thegra_core.errors import ConfigError
 from thegra_core.process import keep_freed_memory
 from thegra_ros.environment import use_large_segments
+
+STAGES = ("preprocessing", "frontend", "tracking", "mapping")
+POLL_S = 0.1
+PATIENCE_S = 2.5
+"""How long the nodes may take to end, all together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +29,7 @@ class LiveOptions:
     config: Path | None = None
     namespace: str = "thegra"
     extra: tuple[str, ...] = ()
+    single_process: bool = True
 
 
 def live(options: LiveOptions) -> int:
@@ -30,11 +40,41 @@ def live(options: LiveOptions) -> int:
     """
     arguments = ros_arguments(options)
     use_large_segments()
+    if not options.single_process:
+        return supervise([[sys.executable, "-m", f"thegra_ros.nodes.{name}", *arguments] for name in STAGES])
     keep_freed_memory()
     from thegra_ros.lifecycle import run_node
     from thegra_ros.nodes.slam import SlamNode
 
     return run_node(SlamNode, arguments)
+
+
+def supervise(commands: list[list[str]]) -> int:
+    """Run processes until told to end, or until one of them ends, which ends the others; 0, or the code of the one that ended first."""
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, _interrupt)
+    processes = [subprocess.Popen(command) for command in commands]
+    try:
+        while all(process.poll() is None for process in processes):
+            time.sleep(POLL_S)
+        return next((process.returncode for process in processes if process.returncode), 0)
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, signal.SIG_IGN)
+        for process in processes:
+            process.terminate()
+        end = time.monotonic() + PATIENCE_S
+        for process in processes:
+            try:
+                process.wait(max(0.0, end - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 def ros_arguments(options: LiveOptions) -> list[str]:

@@ -13,6 +13,8 @@ from thegra_ros.frame_queue import LatestQueue
 from thegra_ros.lifecycle import ManagedNode
 from thegra_ros.node_parameters import NodeParameters
 
+LAST_S = 1.0
+"""How long the work on a frame may go on when the process ends."""
 EVERYTHING = 10**6
 """Size of a queue that drops nothing."""
 
@@ -68,7 +70,7 @@ class StageNode(ManagedNode):
         if self.queue is not None:
             self.queue.close()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(None if self.context.ok() else LAST_S)  # a process that ends does not wait for networks to load
         self.queue = self._thread = None
         self._settings.configured = False
 

@@ -55,3 +55,14 @@ def test_what_is_not_understood_is_said(tmp_path: Path) -> None:
         ros_arguments(LiveOptions(extra=("--speed", "2")))
     with pytest.raises(ConfigError, match=r"none\.yaml does not exist"):
         ros_arguments(LiveOptions(config=tmp_path / "none.yaml"))
+
+
+def test_when_one_node_ends_the_others_do() -> None:
+    """In a process of its own, for its handling of signals."""
+    code = """
+import sys
+from thegra_ros.live import supervise
+forever = [sys.executable, "-c", "import signal; signal.pause()"]
+sys.exit(supervise([forever, [sys.executable, "-c", "raise SystemExit(7)"]]))
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=120).returncode == 7
