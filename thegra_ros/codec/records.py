@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from thegra_core.messages import Features, InitialMap, Keyframe, KeyframeState, LandmarkArrays, MapUpdate, Matches, VisibilityCounts
+from thegra_core.messages import Absorbed, Features, InitialMap, Keyframe, KeyframeState, LandmarkArrays, MapUpdate, Matches, VisibilityCounts
 from thegra_ros.codec.clouds import Table, cloud_message, cloud_table
 
 LANDMARK_COLUMNS = ("ids", "points_world", "normals", "depth_min", "depth_max", "descriptors", "scores")
@@ -129,8 +129,9 @@ def tables_initial_map(tables: list[Table]) -> InitialMap:
 def update_tables(update: MapUpdate) -> list[Table]:
     """Poses and landmark ids of changed keyframes, landmarks, what was removed, who sees the same, and new keyframes."""
     facts = {"update": str(update.version), "map": str(update.map_id)}
-    if update.correction is not None:
-        facts["correction"] = " ".join(repr(x) for x in update.correction.ravel().tolist())
+    if update.absorbed is not None:
+        facts["absorbed"] = str(update.absorbed.map_id)
+        facts["old_from_absorbed"] = " ".join(repr(x) for x in [*update.absorbed.rigid.ravel().tolist(), update.absorbed.scale])
     tables = [Table(_pose_table({k.id: k.world_from_camera for k in update.keyframes}).columns, facts), *_ragged("keyframe_landmarks", {k.id: k.landmark_ids for k in update.keyframes})]
     if update.landmarks is not None:
         tables.append(Table({name: getattr(update.landmarks, name) for name in LANDMARK_COLUMNS}, {"landmarks": "1"}))
@@ -157,9 +158,16 @@ def tables_update(tables: list[Table]) -> MapUpdate:
         landmarks=LandmarkArrays(**{n: _ids(landmarks, n) if n == "ids" else landmarks.columns[n] for n in LANDMARK_COLUMNS}) if landmarks is not None else None,
         removed_landmark_ids=_ids(named["removed_landmarks"], "id"),
         covisibility={i: tuple((int(a), int(b)) for a, b in pairs.tolist()) for i, pairs in _split(named["covisibility"]).items()},
-        correction=np.array([float(x) for x in facts["correction"].split()]).reshape(4, 4) if "correction" in facts else None,
+        absorbed=_absorbed(facts),
         scales=dict(zip(_ids(scales, "id").tolist(), scales.columns["scale"].tolist(), strict=True)),
     )
+
+
+def _absorbed(facts: Mapping[str, str]) -> Absorbed | None:
+    if "absorbed" not in facts:
+        return None
+    *rigid, scale = (float(x) for x in facts["old_from_absorbed"].split())
+    return Absorbed(int(facts["absorbed"]), np.array(rigid).reshape(4, 4), scale)
 
 
 # ---- pieces -------------------------------------------------------------------------------------------------------------------------

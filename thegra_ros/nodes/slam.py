@@ -124,7 +124,8 @@ class SlamNode(ManagedNode):
         result = done.result
         if result.map_id >= 0 and result.map_id != self._map_id:
             if self._map_id >= 0:
-                self.get_logger().warning(f"lost, and a new map ({result.map_id}) was begun: poses are in a new frame of reference")
+                news = f"a new map ({result.map_id}) was begun after tracking was lost" if result.map_id > self._map_id else f"the map has become part of map {result.map_id}"
+                self.get_logger().warning(f"{news}: poses are in another frame of reference from now on")
             self._map_id = result.map_id
         self._poses.publish(result, self._place.frames)
         if done.map is not None and result.state is TrackingState.TRACKING:
