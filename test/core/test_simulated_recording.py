@@ -23,7 +23,7 @@ from thegra_core.sources.calibration import load_camera
 from thegra_core.sources.open import all_topics, camera_for, image_topics, open_recording
 from thegra_core.sources.summary import summarize
 
-SMALL = SimulationOptions(duration_s=1.2, image_size=(80, 64))
+SMALL = SimulationOptions(duration_s=0.6, image_size=(80, 64))
 
 
 def digest(folder: Path) -> str:
@@ -96,7 +96,7 @@ def test_a_closed_shutter_leaves_a_gap_or_repeats_the_last_image_bit_for_bit(tmp
 def test_ground_truth_holds_at_the_stamp_however_it_jitters(tmp_path: Path) -> None:
     jittering = SMALL.model_copy(update={"sensor": SensorConfig(stamp_jitter_us=5000), "image_size": (40, 32)})
     kind = SCENES["room"]
-    path = HandHeldPath(kind.route(), STYLES["robust"], 1.2, 0)
+    path = HandHeldPath(kind.route(), STYLES["robust"], 0.6, 0)
     for tick in rendered(jittering).ticks:
         assert np.allclose(tick.world_from_camera, path.pose((tick.stamp_ns - START_NS) * 1e-9), atol=1e-9)
 

@@ -116,6 +116,17 @@ def test_a_hovering_camera_that_pans_claims_no_journey(shared_data: Path, tmp_pa
     assert figures(shared_data / "neg_hover_pan_hit", tmp_path)["extent"] < SHORT
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(PATIENCE_S)
+@pytest.mark.parametrize(("scene", "shutter", "ate_rmse"), [("room", "freeze", 0.15), ("tunnel", "gap", 0.25)])
+def test_simulated_scenes_are_tracked(tmp_path: Path, scene: Any, shutter: Any, ate_rmse: float) -> None:
+    options = SimulationOptions(scene=scene, shutter=shutter, duration_s=12, image_size=(320, 256))
+    reached = figures(simulate(options, tmp_path / scene, "folder"), tmp_path / "out", profile="fast")
+    assert reached["tracked_pct"] >= 95
+    assert reached["ate_rmse"] <= ate_rmse
+    assert reached["in_closure"] == 0, "no pose is claimed while the shutter is closed"
+
+
 def test_same_input_same_bytes(tmp_path: Path) -> None:
     bag = simulate(SimulationOptions(duration_s=0.8, image_size=(256, 192)), tmp_path / "bag")
     extractor = "orb" if missing_weights("fast") else "xfeat"
