@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from thegra_core.simulation.demo import make_demo_bag, thermal_camera
 
 from thegra_core.messages import Frame
+from thegra_core.simulation.cameras import thermal_camera
+from thegra_core.simulation.simulate import SimulationOptions, simulate
 from thegra_core.sources.open import open_recording
 
 if TYPE_CHECKING:
@@ -26,12 +27,14 @@ if importlib.util.find_spec("rclpy") is not None:
         warnings.simplefilter("ignore", DeprecationWarning)
         import rosidl_generator_py  # noqa: F401
 
+SIZE = (320, 256)
 _domains = itertools.count(os.getpid())
 
 
 @pytest.fixture(scope="session")
 def recording_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_demo_bag(tmp_path_factory.mktemp("demo") / "bag", duration_s=3.0)
+    options = SimulationOptions(scene="room", style="aggressive", duration_s=3.0, rate_hz=10.0, image_size=SIZE)
+    return simulate(options, tmp_path_factory.mktemp("demo") / "bag")
 
 
 @pytest.fixture(scope="session")
@@ -41,7 +44,7 @@ def frames(recording_path: Path) -> list[Frame]:
 
 @pytest.fixture(scope="session")
 def camera() -> CameraModel:
-    return thermal_camera()
+    return thermal_camera(SIZE)
 
 
 @pytest.fixture

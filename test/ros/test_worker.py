@@ -6,11 +6,11 @@ import threading
 
 import numpy as np
 import pytest
-from thegra_core.simulation.demo import thermal_camera
 
 from thegra_core.config import load_config
 from thegra_core.errors import WeightsError
 from thegra_core.messages import Frame, TrackingResult, TrackingState
+from thegra_core.simulation.cameras import thermal_camera
 from thegra_ros.engine import Done, EngineError, Job, LocalEngine
 from thegra_ros.worker import MOST_FAILURES, Worker
 
