@@ -14,6 +14,7 @@ import pytest
 
 from thegra_core.messages import Frame
 from thegra_core.simulation.cameras import thermal_camera
+from thegra_core.simulation.sensor_config import SensorConfig
 from thegra_core.simulation.simulate import SimulationOptions, simulate
 from thegra_core.sources.open import open_recording
 
@@ -33,7 +34,7 @@ _domains = itertools.count(os.getpid())
 
 @pytest.fixture(scope="session")
 def recording_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    options = SimulationOptions(scene="room", style="aggressive", duration_s=3.0, rate_hz=10.0, image_size=SIZE)
+    options = SimulationOptions(scene="room", style="aggressive", duration_s=4.0, rate_hz=10.0, image_size=SIZE, sensor=SensorConfig(netd_mk=15))  # easy: the tests use ORB
     return simulate(options, tmp_path_factory.mktemp("demo") / "bag")
 
 

@@ -123,8 +123,18 @@ class Graph:
 
     def send_camera(self, camera: CameraModel, listeners: int = 1) -> None:
         self.wait(lambda: self._infos.get_subscription_count() >= listeners, "nodes that listen to camera_info")
-        self._infos.publish(camera_info_message(header(0, "thermal_camera"), camera))
+        message = camera_info_message(header(0, "thermal_camera"), camera)
+        self._infos.publish(message)
         self._infos.wait_for_all_acked()
+        if message.k[0] > 0:
+            self.wait(lambda: self._is_known(message), "a node that knows the camera")
+
+    def _is_known(self, message: CameraInfo) -> bool:
+        """Whether the node says that it has a camera; else it is told again, as drivers do: one message may be lost while the two ends find each other."""
+        if self.value("camera") != "unknown":
+            return True
+        self._infos.publish(message)
+        return False
 
     def send(self, frames: Sequence[Frame], encoding: str | None = None) -> None:
         for frame in frames:

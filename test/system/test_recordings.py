@@ -128,7 +128,7 @@ def test_simulated_scenes_are_tracked(tmp_path: Path, scene: Any, shutter: Any, 
 
 
 def test_same_input_same_bytes(tmp_path: Path) -> None:
-    bag = simulate(SimulationOptions(duration_s=0.8, image_size=(256, 192)), tmp_path / "bag")
+    bag = simulate(SimulationOptions(style="aggressive", duration_s=1.5, image_size=(320, 256)), tmp_path / "bag")
     extractor = "orb" if missing_weights("fast") else "xfeat"
     outs = [tmp_path / "first", tmp_path / "second"]
     for out in outs:
