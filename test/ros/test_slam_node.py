@@ -55,7 +55,8 @@ def test_poses_are_those_of_the_offline_run(graph: Graph, frames, camera, record
     assert 2 < len(along) <= len(live) and {stamp for stamp, _ in along} <= set(live)
     assert len(path_poses(graph.received["keyframe_path"][-1])) >= 3
     points = cloud_table(graph.received["map_points"][-1]).columns
-    assert len(points["x"]) > 200 and np.median(points["x"]) == pytest.approx(1.0, abs=0.5), "in front of the camera, about one map unit away"
+    distance = np.linalg.norm([points[axis] for axis in "xyz"], axis=0)
+    assert len(distance) > 200 and 0.3 < np.median(distance) < 3.0, "around the camera, about one map unit away"
     assert len(tracks) == len(frames) and tracks[-1].encoding == "bgr8"
 
     truth = dict(zip((t := read_tum(recording_path.parent / "bag" / "groundtruth.txt")).stamps_ns.tolist(), t.poses[:, :3, 3], strict=True))
