@@ -287,7 +287,7 @@ class BundleConfig(Section):
 class RelocalizationConfig(Section):
     """What happens after tracking is lost."""
 
-    keyframes: int = Field(3, ge=1, description="last keyframes that a lost frame is matched to")
+    keyframes: int = Field(3, ge=1, description="keyframes that a lost frame is matched to: at first the last ones, then those of the whole map that look most alike")
     search_keyframes: int = Field(6, ge=1, description="the same after a shutter closure")
     search_frames: int = Field(5, ge=0, description="frames after a closure that are matched to so many before tracking counts as lost")
     min_inliers: int = Field(30, ge=6, description="inliers of an accepted relocalisation")

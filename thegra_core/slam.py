@@ -155,12 +155,14 @@ class Slam:
         """Image, keypoints and tracks of the last frame; None if it was bad or the shutter was closed."""
         return self._view() if self._view is not None else None
 
-    def current_map(self) -> tuple[FloatArray, FloatArray]:
-        """Keyframe poses (K, 4, 4) and landmarks (L, 3) of the map being tracked, for viewers; empty before the first map."""
-        summary = self.current_summary()
-        return (summary.keyframe_poses, summary.points_world) if summary is not None else (np.empty((0, 4, 4)), np.empty((0, 3)))
+    def map_size(self) -> tuple[int, int]:
+        """Keyframes and landmarks of the map being tracked."""
+        if self._tracking.map_id < 0:
+            return 0, 0
+        current = self._mapper.map(self._tracking.map_id)
+        return len(current.keyframes), len(current.landmarks)
 
-    def current_summary(self) -> MapSummary | None:
+    def current_map(self) -> MapSummary | None:
         """A copy of what the map being tracked holds; None before the first map."""
         return self._mapper.summary(self._tracking.map_id) if self._tracking.map_id >= 0 else None
 

@@ -95,7 +95,7 @@ class LocalEngine:
         try:
             result = slam.process(job.frame)
             view = slam.snapshot() if job.wants_view else None
-            return Done(result, view, slam.current_summary() if job.wants_map else None)
+            return Done(result, view, slam.current_map() if job.wants_map else None)
         except Exception as error:
             self._slam = None
             raise EngineError(traceback.format_exc()) from error

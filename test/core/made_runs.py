@@ -112,8 +112,11 @@ class FakeSystem:
     def snapshot(self) -> Snapshot | None:
         return self._run.snapshots[0]
 
-    def current_map(self) -> tuple[np.ndarray, np.ndarray]:
-        return self._run.maps[0].keyframe_poses, self._run.maps[0].points_world
+    def current_map(self) -> MapSummary:
+        return self._run.maps[0]
+
+    def map_size(self) -> tuple[int, int]:
+        return len(self._run.maps[0].keyframe_poses), len(self._run.maps[0].points_world)
 
     def finish(self, progress: Any = None) -> Run:
         frames = self._run.frames[: self.processed]

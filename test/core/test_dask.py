@@ -17,7 +17,7 @@ from dataset_making import pretend, thermal
 from thegra_core.evaluation.tasks import Outcome, RunTask, execute
 from thegra_core.evaluation.workers import run_tasks
 
-distributed = pytest.importorskip("distributed")
+distributed = pytest.importorskip("distributed", reason="Dask is not installed: pip install -e .[dask]")
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 

@@ -9,12 +9,15 @@ from hypothesis import strategies as st
 from synthetic import CAMERA, FakeExtractor, FakeMatcher, look, loop, observe, room, stamp
 from test_slam import CONFIG, ate, frames, make, play
 
+from thegra_core.config import LoopConfig
 from thegra_core.geometry import poses
 from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.editor import MapEditor
 from thegra_core.map.map import Map
+from thegra_core.mapping.merging import MapMerger
 from thegra_core.messages import Keyframe, TrackingState
 from thegra_core.outputs.trajectory import live_trajectory
+from thegra_core.places.index import PlaceIndex
 from thegra_core.slam import Slam
 
 WORLD = room(1500)
@@ -123,3 +126,19 @@ def test_the_update_after_absorbing_is_the_whole_map() -> None:
     replica.apply(update)
     assert sorted(replica.keyframes) == [0, 1, 2, 3] == sorted(replica.covisibility)
     np.testing.assert_array_equal(replica.landmarks.alive_ids(), old.map.landmarks.alive_ids())
+
+
+def test_a_tie_takes_two_keyframes_of_the_same_map() -> None:
+    """What one keyframe of a map saw is no word for the next map, when the first was given up in between."""
+    config = CONFIG.model_copy(update={"loop": LoopConfig(vocabulary_keyframes=2, words=16)})
+    old, index = small_map(0, 0, Similarity(np.eye(4))), PlaceIndex(config.loop, seed=0)
+    for i, keyframe in old.map.keyframes.items():
+        index.add(i, keyframe.features)
+    others = {0: (old.map, index)}
+    merger = MapMerger(config, FakeMatcher())
+    given_up, later = small_map(1, 2, Similarity(np.eye(4), 2.0)), small_map(2, 10, Similarity(np.eye(4), 0.5))
+    assert merger.find(given_up.map, 2, others) is None
+    assert merger.find(later.map, 10, others) is None
+    tie = merger.find(later.map, 11, others)
+    assert tie is not None and tie.old_map_id == 0 and [s.keyframe_id for s in tie.sightings] == [10, 11]
+    assert tie.old_from_new(later.map).scale == pytest.approx(2.0, rel=0.01)

@@ -57,9 +57,9 @@ def test_index_gives_places_seen_before_and_nothing_else():
     for i, yaw in enumerate(yaws):
         index.add(i, view(yaw, i))
         if i < 3:
-            assert index.similarity(i) == {}
+            assert index.query(view(yaw, i), 3) == []
             assert index.candidates(i, [0]) == []
-    assert set(index.similarity(25)) == set(range(26))
+    assert set(index.query(view(17, 25), 99)) == set(range(26))
     found = index.candidates(25, [24, 23])
     assert found[0] == 1
     assert set(found) <= {0, 1, 2, 3}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -177,3 +179,10 @@ def test_stamps_jitter_about_the_time_and_stay_in_order() -> None:
 def test_every_parameter_says_what_it_is() -> None:
     for name, field in SensorConfig.model_fields.items():
         assert field.description and len(field.description) > 20, name
+
+
+def test_the_documented_parameters_are_those_there_are() -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "simulator.md").read_text(encoding="utf-8")
+    for name, parameter in SensorConfig.model_fields.items():
+        default = parameter.default if isinstance(parameter.default, str) else f"{parameter.default:g}"
+        assert f"| `{name}` | {default} | {parameter.description} |" in page

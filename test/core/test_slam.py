@@ -300,15 +300,16 @@ def test_the_world_thins_out_while_tracking() -> None:
 def test_snapshot_and_current_map_for_viewers() -> None:
     slam = make(walk_world(), WALK)
     assert slam.snapshot() is None
-    assert slam.current_map()[0].shape == (0, 4, 4) and slam.current_map()[1].shape == (0, 3)
+    assert slam.current_map() is None and slam.map_size() == (0, 0)
     for frame in frames(20):
         slam.process(frame)
     view = slam.snapshot()
     assert view is not None and view.state is TrackingState.TRACKING
     assert view.image.shape == (HEIGHT, WIDTH) and len(view.keypoints) == len(view.tracked) == len(view.previous)
     assert view.tracked.sum() > 50
-    shown, landmarks = slam.current_map()
-    assert len(shown) > 2 and len(landmarks) > 50
+    shown = slam.current_map()
+    assert shown is not None and len(shown.keyframe_poses) > 2 and len(shown.points_world) > 50
+    assert slam.map_size() == (len(shown.keyframe_poses), len(shown.points_world))
     matched = view.tracked & np.isfinite(view.previous).all(axis=1)
     shift = np.linalg.norm(view.keypoints[matched] - view.previous[matched], axis=1)
     assert matched.sum() > 30 and shift.max() < 150

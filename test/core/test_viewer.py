@@ -15,7 +15,7 @@ def test_no_viewer_asks_for_nothing() -> None:
         def snapshot(self):
             raise AssertionError("a headless run must not pay for pictures")
 
-        current_map = snapshot
+        current_map = map_size = snapshot
 
     run = make_run()
     viewer = make_viewer("none")

@@ -33,13 +33,18 @@ def missing_weights(profile: str) -> str:
     return ""
 
 
-def figures(recording: Path, out: Path, max_frames: int | None = None, profile: str = "quality") -> dict[str, Any]:
-    """Figures of one run with seed 0."""
+def needs(recording: Path, profile: str) -> None:
+    """Skip, and say why, where the recording or the profile's weights are not there."""
     if not recording.is_dir():
         pytest.skip(f"no recording {recording}")
     missing = missing_weights(profile)
     if missing:
-        pytest.skip(missing)
+        pytest.skip(f"no weights of profile {profile}: {missing}")
+
+
+def figures(recording: Path, out: Path, max_frames: int | None = None, profile: str = "quality") -> dict[str, Any]:
+    """Figures of one run with seed 0."""
+    needs(recording, profile)
     limits = {recording.name: max_frames} if max_frames is not None else {}
     plan = Plan((recording,), out, (profile,), max_frames=limits)
     (run,) = planned_runs(plan)
@@ -76,8 +81,7 @@ def test_it_tracks(shared_data: Path, tmp_path: Path, profile: str, name: str, t
 @pytest.mark.timeout(PATIENCE_S)
 def test_a_closed_shutter_may_leave_a_gap_instead_of_frozen_frames(shared_data: Path, tmp_path: Path) -> None:
     whole, cut = shared_data / "sim_room_shutter", tmp_path / "cut"
-    if not whole.is_dir():
-        pytest.skip(f"no recording {whole}")
+    needs(whole, "quality")
     cut.mkdir()
     for name in ("images", "camera.yaml", "groundtruth.txt", "shutter.txt"):
         (cut / name).symlink_to(whole / name)

@@ -104,7 +104,7 @@ class Bar:
         """Advance by a frame, and say it when the state or the reason for waiting changes."""
         self._frames += 1
         if result.is_keyframe:
-            self._keyframes, self._landmarks = (len(array) for array in scene.current_map())
+            self._keyframes, self._landmarks = scene.map_size()
         if self._news.is_new(result):
             reason = f": {escape(result.reason)}" if result.reason else ""
             self._console.print(f"  frame {self._frames}: {_coloured(result.state)}{reason}", highlight=False, soft_wrap=True)

@@ -40,9 +40,8 @@ class LoopCloser:
     def __post_init__(self) -> None:
         self.index = PlaceIndex(self.config.loop, self.config.seed)
 
-    def add(self, editor: MapEditor, keyframe_id: int, graph: MatchGraph) -> bool:
-        """Take a keyframe that mapping has finished with; True if it closed a loop."""
-        self.index.add(keyframe_id, editor.map.keyframes[keyframe_id].features)
+    def look(self, editor: MapEditor, keyframe_id: int, graph: MatchGraph) -> bool:
+        """Whether a keyframe of the index, which mapping has finished with, closed a loop."""
         sighting = self._find(editor, keyframe_id)
         before, self._waiting = self._waiting, sighting
         if before is None or sighting is None or not agree(editor.map, before, sighting, self.config):

@@ -72,8 +72,10 @@ class Mapper:
         editor.connect(keyframe.id)
         adjust_locally(editor, keyframe.id, self._config)
         editor.connect(keyframe.id)
+        loops = self._loops[keyframe.map_id]
+        loops.index.add(keyframe.id, keyframe.features)
         if self._config.loop.enabled:
-            self._loops[keyframe.map_id].add(editor, keyframe.id, self._graphs[keyframe.map_id])
+            loops.look(editor, keyframe.id, self._graphs[keyframe.map_id])
             merged = self._merge(editor, keyframe.id)
             if merged is not None:
                 return merged

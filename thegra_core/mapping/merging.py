@@ -13,12 +13,10 @@ from thegra_core.map.editor import MapEditor
 from thegra_core.map.map import Map
 from thegra_core.mapping.adjustment import adjust_all
 from thegra_core.mapping.loop_closing import ESSENTIAL_NEIGHBOURS, fuse_sighting
-from thegra_core.places.index import PlaceIndex
+from thegra_core.places.index import NEAR, PlaceIndex
 from thegra_core.places.verification import Sighting, agree, sight
 
 logger = logging.getLogger(__name__)
-NEAR = 5
-"""Neighbours of a keyframe that say how alike two images of one place are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +43,9 @@ class MapMerger:
     def find(self, new: Map, keyframe_id: int, others: Mapping[int, tuple[Map, PlaceIndex]]) -> Tie | None:
         """A tie of the keyframe's map to one of the others, if this keyframe and the one before it make one."""
         keyframe = new.keyframes[keyframe_id]
-        near = [new.keyframes[i].features for i in new.neighbours(keyframe_id, NEAR)]
-        before, self._waiting = self._waiting, {}
+        before = {map_id: found for map_id, found in self._waiting.items() if found.keyframe_id in new.keyframes}
+        self._waiting = {}
+        near = [new.keyframes[i].features for i in new.neighbours(keyframe_id, NEAR)] if others else []
         for map_id, (old, index) in sorted(others.items()):
             for candidate in index.alike(keyframe.features, near)[:1]:
                 found = sight(new, keyframe_id, old, [candidate, *old.neighbours(candidate, self.config.loop.group - 1)], self.matcher, self.config)

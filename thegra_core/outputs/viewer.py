@@ -9,20 +9,24 @@ from typing import Any, Protocol
 import numpy as np
 
 from thegra_core.errors import ConfigError
-from thegra_core.messages import FloatArray, Run, Snapshot, TrackingResult, TrackingState
+from thegra_core.messages import FloatArray, MapSummary, Run, Snapshot, TrackingResult, TrackingState
 
 VIEWERS = ("none", "rerun")
 
 
 class Scene(Protocol):
-    """What a viewer may ask the running system; both cost time, so only viewers that draw them ask."""
+    """What a viewer may ask the running system; image and map cost time, so only viewers that draw them ask."""
 
     def snapshot(self) -> Snapshot | None:
         """Image and keypoints of the last frame; None if there was nothing to see."""
         ...
 
-    def current_map(self) -> tuple[FloatArray, FloatArray]:
-        """Keyframe poses (K, 4, 4) and landmarks (L, 3) of the map being tracked."""
+    def current_map(self) -> MapSummary | None:
+        """A copy of the map being tracked; None before the first one."""
+        ...
+
+    def map_size(self) -> tuple[int, int]:
+        """Keyframes and landmarks of the map being tracked."""
         ...
 
 
@@ -76,8 +80,9 @@ class RerunViewer:
             recording.log("image/keypoints", rr.Points2D(picture.keypoints, colors=colours, radii=2.0))
         if result.world_from_camera is not None:
             self._show_pose(result.world_from_camera, result.state)
-        if result.is_keyframe:
-            self._show_map(*scene.current_map())
+        current = scene.current_map() if result.is_keyframe else None
+        if current is not None:
+            self._show_map(current.keyframe_poses, current.points_world)
         recording.log("state", rr.TextLog(f"{result.state.value} {result.reason}".strip()))
         for name in ("keypoints", "matches", "inliers"):
             recording.log(f"counts/{name}", rr.Scalars(float(getattr(result, name))))

@@ -14,6 +14,9 @@ from thegra_core.places.descriptor import describe, learn_vocabulary
 
 FloatArray = NDArray[np.float32]
 
+NEAR = 5
+"""Images of the same place that say how alike two images of it are."""
+
 
 class PlaceIndex:
     """Keyframes by their image's vector. The vocabulary is learnt from the first keyframes of the map; until then nothing is found."""
@@ -39,26 +42,30 @@ class PlaceIndex:
             return
         self._append(keyframe_id, features)
 
-    def similarity(self, keyframe_id: int) -> dict[int, float]:
-        """Cosine of every keyframe's vector with that of one of them; empty while there is no vocabulary."""
-        if keyframe_id not in self._rows:
-            return {}
-        known = self._vectors[: len(self._rows)]
-        return dict(zip(self._rows, (known @ known[self._rows[keyframe_id]]).tolist(), strict=True))
-
     def query(self, features: Features, most: int) -> list[int]:
         """At most `most` keyframes that look most like an image that is none of them, the most similar first."""
-        similar = self._similar(features)
-        return sorted(similar, key=lambda i: (-similar[i], i))[:most]
+        if self._vocabulary is None:
+            return []
+        return _ranked(self._similar(describe(features, self._vocabulary)))[:most]
 
     def alike(self, features: Features, near: Sequence[Features]) -> list[int]:
-        """Keyframes that look nearly as much like an image that is none of them as the images `near` it do, the most similar first."""
-        if self._vocabulary is None or not near:
+        """Keyframes that look nearly as much like an image that is none of them as the first images of `near` it do, the most similar first."""
+        if self._vocabulary is None:
             return []
         vector = describe(features, self._vocabulary)
-        bar = self._config.similarity_share * float(np.median([vector @ describe(other, self._vocabulary) for other in near]))
-        similar = self._similar(features)
-        return sorted((i for i, value in similar.items() if value >= bar), key=lambda i: (-similar[i], i))
+        return self._above_bar(self._similar(vector), [float(vector @ describe(other, self._vocabulary)) for other in near[:NEAR]])
+
+    def candidates(self, keyframe_id: int, connected: Sequence[int]) -> list[int]:
+        """Keyframes that look nearly as much like this one as those do that see the same, the most similar first.
+
+        connected: ids that are no news, those that share most with it first.
+        """
+        if keyframe_id not in self._rows:
+            return []
+        similar = self._similar(self._vectors[self._rows[keyframe_id]])
+        del similar[keyframe_id]
+        near = [similar.pop(i) for i in connected if i in similar]
+        return self._above_bar(similar, near[:NEAR])
 
     def arrays(self) -> Arrays:
         """Words and vectors for a map file; nothing before there are words."""
@@ -76,23 +83,15 @@ class PlaceIndex:
         self._vocabulary, self._vectors = arrays["vocabulary"], arrays["vectors"]
         self._rows = {keyframe_id: row for row, keyframe_id in enumerate(arrays["ids"].tolist())}
 
-    def candidates(self, keyframe_id: int, connected: Sequence[int]) -> list[int]:
-        """Keyframes that look nearly as much like this one as those do that see the same, the most similar first.
+    def _similar(self, vector: FloatArray) -> dict[int, float]:
+        """Cosine of every keyframe's vector with a vector."""
+        return dict(zip(self._rows, (self._vectors[: len(self._rows)] @ vector).tolist(), strict=True))
 
-        connected: ids that are no news, those that share most with it first; the first five set the bar.
-        """
-        similar = self.similarity(keyframe_id)
-        near = [similar[i] for i in connected if i in similar and i != keyframe_id][:5]
+    def _above_bar(self, similar: dict[int, float], near: list[float]) -> list[int]:
         if not near:
             return []
         bar = self._config.similarity_share * float(np.median(near))
-        found = [(value, i) for i, value in similar.items() if value >= bar and i != keyframe_id and i not in connected]
-        return [i for _, i in sorted(found, reverse=True)]
-
-    def _similar(self, features: Features) -> dict[int, float]:
-        if self._vocabulary is None:
-            return {}
-        return dict(zip(self._rows, (self._vectors[: len(self._rows)] @ describe(features, self._vocabulary)).tolist(), strict=True))
+        return _ranked({i: value for i, value in similar.items() if value >= bar})
 
     def _append(self, keyframe_id: int, features: Features) -> None:
         assert self._vocabulary is not None
@@ -105,3 +104,7 @@ class PlaceIndex:
             self._vectors = grown
         self._vectors[count] = vector
         self._rows[keyframe_id] = count
+
+
+def _ranked(similar: dict[int, float]) -> list[int]:
+    return sorted(similar, key=lambda i: (-similar[i], i))

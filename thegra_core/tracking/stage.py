@@ -89,6 +89,11 @@ class _Place:
     def reference(self) -> Features:
         return self.map.keyframes[self.reference_id].features
 
+    def take(self, update: MapUpdate) -> None:
+        self.map.apply(update)
+        for message in update.new_keyframes:
+            self.places.add(message.id, message.features)
+
     def predict(self, stamp_ns: int) -> FloatArray | None:
         return self.motion.predict(stamp_ns) if self.lost_frames == 0 else None
 
@@ -182,9 +187,7 @@ class TrackingStage:
         else:
             return
         before = {m.id: m.world_from_camera for m in update.new_keyframes}
-        place.map.apply(update)
-        for message in update.new_keyframes:
-            place.places.add(message.id, message.features)
+        place.take(update)
         if before:
             newest = max(before)
             place.reference_id = place.last_keyframe_id = newest
@@ -197,9 +200,7 @@ class TrackingStage:
         if place is None or place.map.map_id != absorbed.map_id:
             return
         place.map, place.places = Map(update.map_id, self._camera), self._place_index()
-        place.map.apply(update)
-        for message in update.new_keyframes:
-            place.places.add(message.id, message.features)
+        place.take(update)
         place.motion.move(Similarity(absorbed.rigid, absorbed.scale))
         place.reference_id = place.last_keyframe_id = max(m.id for m in update.new_keyframes)
         place.probation, self._before = 0, None
