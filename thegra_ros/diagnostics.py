@@ -55,10 +55,9 @@ class Health:
         self.last_sign_s = time.monotonic()
 
     def result_came(self, result: TrackingResult) -> bool:
-        """A frame was worked on; True if that changes what there is to say."""
+        """What a frame came to; True if that changes what there is to say."""
         changed = result.state is not self.state
         self.state, self.reason = result.state, result.reason
-        self.done += 1
         self.last_sign_s = time.monotonic()
         return changed
 

@@ -134,6 +134,7 @@ class SlamNode(ManagedNode):
         if done.view is not None:
             self._tracks.publish(done.view, self._place.frames.camera)
         self._ms, self._age_ms = ms, (self.get_clock().now().nanoseconds - result.stamp_ns) / 1e6
+        self._health.done += 1
         if self._health.result_came(result):
             self._reporter.report()
 

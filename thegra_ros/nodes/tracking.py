@@ -82,7 +82,6 @@ class TrackingNode(StageNode):
         self._poses.publish(output.result, self._place.frames)
         if self.health.result_came(output.result):
             self.reporter.report()
-        self.health.done -= 1  # the base counts it
 
     def begin_anew(self, why: str) -> None:
         self._fresh = True
