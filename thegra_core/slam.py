@@ -72,11 +72,16 @@ class _Placed:
 class Slam:
     """Frames in, poses out; `finish` gives the account of the run.
 
+    Args:
+        keep_records: Remember every frame for `finish`. A live stream has no end and needs only the last one.
+
     Raises:
         WeightsError: If the configured networks' weights are not there.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None) -> None:
+    def __init__(
+        self, camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None, keep_records: bool = True
+    ) -> None:
         self._camera = camera
         self._chain = Chain(config.preprocessing)
         self._shutter = ShutterDetector(config.preprocessing.shutter)
@@ -87,6 +92,7 @@ class Slam:
         self._tracking = TrackingStage(camera, config, self._matcher)
         self._mapper = Mapper(camera, config, self._matcher)
         self._frames: list[_Placed] = []
+        self._keep_records = keep_records
         self._last_stamp_ns: int | None = None
         self._backward, self._backward_ns = 0, None  # type: int, int | None
         self._bad: Counter[str] = Counter()
@@ -259,6 +265,8 @@ class Slam:
                 self._closures.append((shutter.stamp_ns, shutter.stamp_ns))
 
     def _record(self, index: int, result: TrackingResult, provisional: TrackingResult | None, bad: bool) -> None:
+        if not self._keep_records:
+            self._frames.clear()
         placed = provisional or result
         if placed.state is not TrackingState.TRACKING or placed.world_from_camera is None:
             self._frames.append(_Placed(result, index, bad=bad))

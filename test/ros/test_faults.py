@@ -95,8 +95,8 @@ def test_lifecycle_requests_that_are_invalid_end_nothing(graph: Graph, frames, c
         graph.wait_for_listener()
         graph.send_camera(camera)
         before = len(graph.received["pose"])
-        graph.send(frames[:12])
-        graph.wait(lambda: graph.processed() == 12)
+        graph.send(frames[:16])
+        graph.wait(lambda: graph.processed() == 16)
         assert len(graph.received["pose"]) > before
         assert graph.change_state(Transition.TRANSITION_DEACTIVATE)
         assert graph.change_state(Transition.TRANSITION_CLEANUP)

@@ -109,7 +109,8 @@ def test_another_epoch_begins_a_new_map(monkeypatch: pytest.MonkeyPatch) -> None
     made: list[object] = []
 
     class FakeSlam:
-        def __init__(self, camera, config, *networks) -> None:
+        def __init__(self, camera, config, *networks, keep_records=True) -> None:
+            assert not keep_records, 'a live stream has no end'
             made.append(networks)
 
         def process(self, frame: Frame) -> TrackingResult:

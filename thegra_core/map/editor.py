@@ -194,13 +194,17 @@ class MapEditor:
             keyframe.world_from_camera = (self_from_other @ Similarity(keyframe.world_from_camera)).rigid
             self.map.keyframes[keyframe.id] = keyframe
         self.map.covisibility.update(other.map.covisibility)
+        self.touch_all()
+        return renamed
+
+    def touch_all(self) -> None:
+        """Let all of the map count as changed, as a replica that begins needs it."""
         self._new = [
             Keyframe(k.id, k.stamp_ns, k.world_from_camera, k.features, k.landmark_ids, k.reference_id, self.map.map_id) for k in self.map.keyframes.values()
         ]
         self._keyframes.update(self.map.keyframes)
         self._landmarks.update(self.map.landmarks.alive_ids().tolist())
         self._edges.update(self.map.covisibility)
-        return renamed
 
     def place(self, landmark: int, point_world: FloatArray) -> None:
         """Set the position (3,) of one landmark."""

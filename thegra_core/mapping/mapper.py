@@ -109,6 +109,12 @@ class Mapper:
         logger.info("%s: %d keyframes and %d landmarks", path, len(kept.editor.map.keyframes), len(kept.editor.map.landmarks))
         return kept.editor.take_update()
 
+    def whole(self, map_id: int) -> MapUpdate:
+        """All of a map as an update, for a replica that begins."""
+        editor = self._editors[map_id]
+        editor.touch_all()
+        return editor.take_update()
+
     def drop(self, map_id: int) -> None:
         """Forget a map that tracking has given up."""
         del self._editors[map_id], self._trial[map_id], self._graphs[map_id], self._loops[map_id]

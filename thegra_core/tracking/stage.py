@@ -159,13 +159,16 @@ class TrackingStage:
         )  # fmt: skip
         return TrackingOutput(result)
 
-    def resume(self, update: MapUpdate) -> None:
-        """Take up a map that was kept, before the first frame: the frames to come are sought in all of it."""
+    def resume(self, update: MapUpdate, next_map_id: int = 0, next_keyframe_id: int = 0) -> None:
+        """Take up a map that was kept, before the first frame: the frames to come are sought in all of it.
+
+        New maps and keyframes get ids that the map does not hold, from `next_map_id` and `next_keyframe_id` on: mapping may have other maps beside it.
+        """
         newest = max(m.id for m in update.new_keyframes)
         place = _Place(Map(update.map_id, self._camera), self._place_index(), newest, newest, probation=0, lost_frames=1, resumed=True)
         place.search_frames = self._config.relocalization.search_frames
         self._place = place
-        self._next_map_id, self._next_keyframe_id = update.map_id + 1, newest + 1
+        self._next_map_id, self._next_keyframe_id = max(update.map_id + 1, next_map_id), max(newest + 1, next_keyframe_id)
         self.apply(update)
 
     def reopen(self) -> None:

@@ -48,6 +48,11 @@ class Assembler:
         return table.facts["record"], parts
 
 
+def word(facts: Mapping[str, str]) -> Table:
+    """A table that holds facts only."""
+    return Table({"id": np.empty(0, np.int64)}, facts)
+
+
 # ---- features and matches -----------------------------------------------------------------------------------------------------------
 
 
