@@ -35,6 +35,8 @@ LIMIT_S = float(os.environ.get("THEGRA_TEST_LIMIT_S", "120"))
 NAMESPACE = "/thegra"
 FAST = {"profile": "fast", "extractor.name": "orb", "preprocessing.filters": "he_clip", "loop.enabled": "false"}
 """Parameters with which no network is needed, and a frame takes a tenth of a second."""
+OFFLINE = {name: "[{filter: he_clip}]" if name == "preprocessing.filters" else value for name, value in FAST.items() if name != "profile"}
+"""The same as overrides of a configuration."""
 EVERY_IMAGE = {f"qos_overrides.{NAMESPACE}/image_raw.subscription.reliability": "reliable", f"qos_overrides.{NAMESPACE}/image_raw.subscription.depth": "1000", "queue_size": "1000"}
 
 
@@ -96,6 +98,11 @@ class Graph:
         process = NodeProcess(module, {**FAST, **EVERY_IMAGE, **(parameters or {})}, self.environment, log, extra)
         self._processes.append(process)
         return process
+
+    def forget(self, process: NodeProcess) -> None:
+        """It was killed by the test."""
+        process.close()
+        self._processes.remove(process)
 
     def listen(self, kind: type, topic: str, qos: Any) -> list[Any]:
         kept = self.received.setdefault(topic, [])

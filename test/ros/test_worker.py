@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from thegra_core.config import load_config
-from thegra_core.errors import WeightsError
+from thegra_core.errors import InputError, WeightsError
 from thegra_core.messages import Frame, TrackingResult, TrackingState
 from thegra_core.simulation.cameras import thermal_camera
-from thegra_ros.engine import Done, EngineError, Job, LocalEngine
-from thegra_ros.worker import MOST_FAILURES, Worker
+from thegra_ros.engine import Done, EngineError, Job, LocalEngine, Order, SaveMap
+from thegra_ros.worker import MOST_FAILURES, NotWorkingError, Worker
 
 LIMIT_S = 60
 
@@ -34,6 +35,14 @@ class FakeEngine:
             raise failure
         return Done(TrackingResult(job.frame.stamp_ns, TrackingState.LOST))
 
+    def obey(self, order: Order) -> str:
+        assert isinstance(order, SaveMap)
+        if order.path.name == "refused":
+            raise InputError("no map yet")
+        if order.path.name == "fails":
+            raise EngineError("killed")
+        return f"written to {order.path}"
+
     def stop(self) -> None:
         self.stopped += 1
 
@@ -44,6 +53,7 @@ class Harness:
     def __init__(self, *engines: FakeEngine) -> None:
         self.engines, self.made = list(engines), 0
         self.done: list[int] = []
+        self.unwanted: set[int] = set()
         self.failures: list[tuple[str, bool]] = []
         self.changed = threading.Condition()
         self.worker: Worker[int] = Worker(self._make, 100, self._job, self._on_done, self._on_failure)
@@ -53,7 +63,9 @@ class Harness:
         self.made += 1
         return self.engines[self.made - 1]
 
-    def _job(self, item: int) -> Job:
+    def _job(self, item: int) -> Job | None:
+        if item in self.unwanted:
+            return None
         return Job(Frame(item, item, np.zeros((2, 2), np.uint8)), thermal_camera((2, 2)), 0)
 
     def _on_done(self, item: int, done: Done, ms: float) -> None:
@@ -103,6 +115,32 @@ def test_what_the_user_must_put_right_is_not_tried_again() -> None:
     harness.wait(lambda: bool(harness.failures))
     harness.worker.stop()
     assert harness.failures == [("fetch them", True)] and harness.made == 1
+
+
+def test_orders_are_answered_and_a_refused_one_changes_nothing() -> None:
+    harness = Harness(FakeEngine(), FakeEngine())
+    happened: list[str] = []
+    assert harness.worker.ask(SaveMap(Path("/a/map")), lambda: happened.append("then")).result(LIMIT_S) == "written to /a/map"
+    with pytest.raises(InputError, match="no map yet"):
+        harness.worker.ask(SaveMap(Path("/a/refused")), lambda: happened.append("never")).result(LIMIT_S)
+    assert happened == ["then"] and harness.made == 1
+    with pytest.raises(EngineError, match="killed"):
+        harness.worker.ask(SaveMap(Path("/a/fails"))).result(LIMIT_S)
+    harness.unwanted.add(1)
+    for item in (1, 2):
+        harness.worker.queue.put(item)
+    harness.wait(lambda: harness.done == [2])
+    assert harness.made == 2, "what failed was replaced"
+    harness.worker.stop()
+    with pytest.raises(NotWorkingError):
+        harness.worker.ask(SaveMap(Path("/a/map"))).result(LIMIT_S)
+
+
+def test_orders_that_wait_when_the_engine_is_given_up_are_refused() -> None:
+    harness = Harness(FakeEngine(start=WeightsError("fetch them")))
+    with pytest.raises(NotWorkingError, match="diagnostics"):
+        harness.worker.ask(SaveMap(Path("/a/map"))).result(LIMIT_S)
+    harness.worker.stop()
 
 
 def test_another_epoch_begins_a_new_map(monkeypatch: pytest.MonkeyPatch) -> None:

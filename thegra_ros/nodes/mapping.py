@@ -83,8 +83,9 @@ class MappingNode(StageNode):
 
     def _begin(self, wish: Table, stamp: int) -> None:
         """Give tracking what it begins with: the map that is there, that of a file, or none."""
+        question = {"question": wish.facts["question"]}
         if self._of is None:
-            self._send("unknown", [wish], stamp)
+            self._send("unknown", [word(question)], stamp)
             return
         if wish.facts["beginning"] == "reset":
             self._home = None
@@ -96,11 +97,11 @@ class MappingNode(StageNode):
                 return
         mapper, self._replaced = self._mapper, False
         if not mapper.map_ids:
-            self._send("empty", [wish], stamp)
+            self._send("empty", [word(question)], stamp)
             return
         main = _main_map(mapper)
         keyframes = max(max(mapper.map(i).keyframes) for i in mapper.map_ids)
-        taken = {**wish.facts, "next_map": str(max(mapper.map_ids) + 1), "next_keyframe": str(keyframes + 1)}
+        taken = {**question, "next_map": str(max(mapper.map_ids) + 1), "next_keyframe": str(keyframes + 1)}
         self._send("resume", [word(taken), *update_tables(mapper.whole(main))], stamp)
         self._show(mapper, main, stamp)
 
