@@ -32,6 +32,7 @@ from thegra_core.messages import (
     TrackingResult,
     TrackingState,
 )
+from thegra_core.optimization.solver import BundleSolver
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
 from thegra_core.snapshots import SnapshotKeeper
@@ -72,11 +73,16 @@ class _Placed:
 class Slam:
     """Frames in, poses out; `finish` gives the account of the run.
 
+    Args:
+        solver: Makes the full adjustments after loops and merges, see `Mapper`.
+
     Raises:
         WeightsError: If the configured networks' weights are not there.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None) -> None:
+    def __init__(
+        self, camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None, solver: BundleSolver | None = None
+    ) -> None:
         self._camera = camera
         self._chain = Chain(config.preprocessing)
         self._shutter = ShutterDetector(config.preprocessing.shutter)
@@ -85,7 +91,7 @@ class Slam:
         self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
         self._matcher = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
         self._tracking = TrackingStage(camera, config, self._matcher)
-        self._mapper = Mapper(camera, config, self._matcher)
+        self._mapper = Mapper(camera, config, self._matcher, solver)
         self._frames: list[_Placed] = []
         self._last_stamp_ns: int | None = None
         self._backward, self._backward_ns = 0, None  # type: int, int | None

@@ -214,6 +214,11 @@ class MapEditor:
 
     # ---- questions ------------------------------------------------------------------------------------------------------------------
 
+    def carrier(self, landmark: int) -> int:
+        """The keyframe that a landmark moves with: the one that saw it first, or the oldest of those that see it."""
+        first = self.first_keyframe[landmark]
+        return first if first in self.map.keyframes else min(self.observers[landmark])
+
     def observations(self, landmark_ids: IntArray) -> tuple[IntArray, IntArray, IntArray]:
         """All observations of the landmarks: index into `landmark_ids`, keyframe id, keypoint index, (M,) each, in a fixed order."""
         triples = [

@@ -12,7 +12,7 @@ from thegra_core.config import ThegraConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.editor import MapEditor
-from thegra_core.mapping.adjustment import adjust_all
+from thegra_core.mapping.adjustment import adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
 from thegra_core.messages import NO_LANDMARK
 from thegra_core.optimization.pose_graph import Edge, optimize_pose_graph
@@ -78,8 +78,8 @@ def _close(editor: MapEditor, sightings: list[Sighting], graph: MatchGraph, conf
     concerned = {i for sighting in sightings for i in (sighting.keyframe_id, *sighting.matches)}
     for keyframe_id in sorted(concerned | {n for i in concerned for n in current.neighbours(i, ESSENTIAL_NEIGHBOURS)}):
         editor.connect(keyframe_id)
-    adjust_all(editor, config)
     last = sightings[-1]
+    adjust_both_sides(editor, last, config)
     moved = np.linalg.norm(current.keyframes[last.keyframe_id].center - before[last.keyframe_id].rigid[:3, 3]) / depth
     logger.info(
         "loop closed: keyframe %d sees what keyframe %d saw, by %d landmarks; it moves by %.3f of the scene's depth, scale %.3f",
@@ -105,7 +105,7 @@ def _move(editor: MapEditor, before: dict[int, Similarity], after: dict[int, Sim
     current = editor.map
     ids = current.landmarks.alive_ids()
     points = current.landmarks.points_world[current.landmarks.rows(ids)].copy()
-    carriers = np.array([_carrier(editor, i) for i in ids.tolist()], dtype=np.int64)
+    carriers = np.array([editor.carrier(i) for i in ids.tolist()], dtype=np.int64)
     for carrier in np.unique(carriers).tolist():
         mine = carriers == carrier
         points[mine] = (after[carrier] @ before[carrier].inverse()).apply(points[mine])
@@ -113,9 +113,11 @@ def _move(editor: MapEditor, before: dict[int, Similarity], after: dict[int, Sim
     editor.move(keyframes, np.stack([after[i].rigid for i in keyframes.tolist()]), ids, points)
 
 
-def _carrier(editor: MapEditor, landmark: int) -> int:
-    first = editor.first_keyframe[landmark]
-    return first if first in editor.map.keyframes else min(editor.observers[landmark])
+def adjust_both_sides(editor: MapEditor, sighting: Sighting, config: ThegraConfig) -> None:
+    """Local adjustments where an old place and a new one have met."""
+    for keyframe_id in (next(iter(sighting.matches)), sighting.keyframe_id):
+        adjust_locally(editor, keyframe_id, config)
+        editor.connect(keyframe_id)
 
 
 def fuse_sighting(editor: MapEditor, sighting: Sighting) -> None:
