@@ -25,6 +25,7 @@ from thegra_core.messages import (
     FrameRecord,
     MapSummary,
     MapUpdate,
+    Revisit,
     Run,
     Shutter,
     ShutterState,
@@ -96,6 +97,7 @@ class Slam:
         self._last_stamp_ns: int | None = None
         self._backward, self._backward_ns = 0, None  # type: int, int | None
         self._bad: Counter[str] = Counter()
+        self._revisits: list[Revisit] = []
         self._closures: list[tuple[int, int]] = []
         self._snapshots = SnapshotKeeper()
         self._view: Callable[[], Snapshot] | None = None
@@ -203,6 +205,7 @@ class Slam:
             losses=self._tracking.losses,
             loops=self._mapper.loops,
             merges=self._mapper.merges,
+            revisits=tuple(self._revisits),
             relocalizations=self._tracking.relocalizations,
             bad_frames=dict(self._bad),
             snapshots=self._snapshots.kept(),
@@ -275,7 +278,10 @@ class Slam:
         self._frames.append(_Placed(result, index, map_id, placed.reference_id, relative, afterwards=provisional is not None))
 
     def _follow(self, update: MapUpdate) -> None:
-        """Frames keep their place beside their keyframe when a loop changes the scale there, or their map becomes part of another."""
+        """Frames keep their place when their keyframe leaves the map, when a loop changes the scale there, or their map becomes part of another."""
+        self._revisits.extend(update.revisits)
+        if update.removed_keyframes:
+            self._inherit(update)
         absorbed = update.absorbed
         if not update.scales and absorbed is None:
             return
@@ -286,6 +292,18 @@ class Slam:
                 self._frames[row] = placed.scaled(absorbed.scale, update.map_id)
             elif placed.map_id == update.map_id:
                 self._frames[row] = placed.scaled(update.scales.get(placed.reference_id, 1.0), update.map_id)
+
+    def _inherit(self, update: MapUpdate) -> None:
+        removed = {r.id: r for r in update.removed_keyframes}
+        by_stamp = {r.stamp_ns: r for r in removed.values() if r.id >= self._first_keyframe_id}
+        map_id = update.map_id if update.absorbed is None else update.absorbed.map_id
+        for row, placed in enumerate(self._frames):
+            gone = removed.get(placed.reference_id)
+            if placed.reference_from_camera is not None and gone is not None:
+                self._frames[row] = replace(placed, reference_id=gone.heir_id, reference_from_camera=gone.heir_from_removed @ placed.reference_from_camera)
+            elif placed.may_be_placed and placed.result.stamp_ns in by_stamp:  # a frame of before the first map, which was this keyframe
+                gone = by_stamp[placed.result.stamp_ns]
+                self._frames[row] = replace(placed, map_id=map_id, reference_id=gone.heir_id, reference_from_camera=gone.heir_from_removed, afterwards=True)
 
     def _drop(self, map_id: int) -> None:
         """Forget a map and the places of frames in it."""

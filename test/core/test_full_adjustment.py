@@ -125,7 +125,7 @@ def test_a_result_waits_for_its_keyframe() -> None:
 
 def test_tracking_follows_a_process_that_adjusts_a_loop() -> None:
     pair = Pair(CONFIG, FakeMatcher(wrong=0.05), ProcessSolver())
-    pair.run(room(1500, seed=12), loop(100, turns=1.15), noise_px=1.0)
+    pair.run(room(count=3000, seed=12), loop(130, turns=1.15), noise_px=1.0)
     assert pair.mapper.loops > 0
     replica, original = pair.tracking._place.map, pair.mapper.map(0)
     assert replica.keyframes.keys() == original.keyframes.keys()

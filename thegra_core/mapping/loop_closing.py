@@ -14,7 +14,7 @@ from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.editor import MapEditor
 from thegra_core.mapping.adjustment import adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
-from thegra_core.messages import NO_LANDMARK
+from thegra_core.messages import NO_LANDMARK, Revisit
 from thegra_core.optimization.pose_graph import Edge, optimize_pose_graph
 from thegra_core.places.index import PlaceIndex
 from thegra_core.places.verification import Sighting, agree, sight
@@ -44,7 +44,7 @@ class LoopCloser:
         """Whether a keyframe of the index, which mapping has finished with, closed a loop."""
         sighting = self._find(editor, keyframe_id)
         before, self._waiting = self._waiting, sighting
-        if before is None or sighting is None or not agree(editor.map, before, sighting, self.config):
+        if before is None or sighting is None or not {before.keyframe_id, *before.matches} <= editor.map.keyframes.keys() or not agree(editor.map, before, sighting, self.config):
             return False
         _close(editor, [before, sighting], graph, self.config)
         self._waiting = None
@@ -80,10 +80,12 @@ def _close(editor: MapEditor, sightings: list[Sighting], graph: MatchGraph, conf
         editor.connect(keyframe_id)
     last = sightings[-1]
     adjust_both_sides(editor, last, config)
-    moved = np.linalg.norm(current.keyframes[last.keyframe_id].center - before[last.keyframe_id].rigid[:3, 3]) / depth
+    moved = float(np.linalg.norm(current.keyframes[last.keyframe_id].center - before[last.keyframe_id].rigid[:3, 3])) / depth
+    keyframe, old_id, scale = current.keyframes[last.keyframe_id], next(iter(last.matches)), last.world_from_camera.scale
+    editor.note(Revisit(keyframe.stamp_ns, current.map_id, keyframe.id, old_id, len(last.keypoints), moved, scale))
     logger.info(
         "loop closed: keyframe %d sees what keyframe %d saw, by %d landmarks; it moves by %.3f of the scene's depth, scale %.3f",
-        last.keyframe_id, next(iter(last.matches)), len(last.keypoints), moved, last.world_from_camera.scale,
+        keyframe.id, old_id, len(last.keypoints), moved, scale,
     )  # fmt: skip
 
 

@@ -80,6 +80,7 @@ class Mapper:
         self._cull(editor, keyframe)
         self._expand(editor, keyframe)
         editor.connect(keyframe.id)
+        self._thin(editor, keyframe.id)
         self._full.collect(editor)
         adjust_locally(editor, keyframe.id, self._config)
         editor.connect(keyframe.id)
@@ -183,6 +184,12 @@ class Mapper:
             editor.remove_landmarks(culling.untrackable(editor, concerned, self._config.mapping))
         remove, self._trial[keyframe.map_id] = culling.failed_trial(editor, trial, keyframe.id, self._config.mapping)
         editor.remove_landmarks(remove)
+
+    def _thin(self, editor: MapEditor, keyframe_id: int) -> None:
+        """Let redundant keyframes go; the newest stay, which tracking and the search for loops hold on to."""
+        for removed in culling.remove_redundant(editor, keyframe_id, self._config.mapping):
+            self._graphs[editor.map.map_id].remove(removed)
+            self._loops[editor.map.map_id].index.remove(removed)
 
     def _expand(self, editor: MapEditor, keyframe: Keyframe) -> None:
         """Match the keyframe to its neighbours, the reference first, whose matches tracking already has, and through them to theirs."""

@@ -91,6 +91,8 @@ class _Place:
 
     def take(self, update: MapUpdate) -> None:
         self.map.apply(update)
+        for removed in update.removed_keyframes:
+            self.places.remove(removed.id)
         for message in update.new_keyframes:
             self.places.add(message.id, message.features)
 
