@@ -107,11 +107,20 @@ class Matches:
 
 
 @dataclass(frozen=True, slots=True)
+class TurnedView:
+    """A frame's image seen turned by a quarter, half or three quarters: its features there, and the upright keypoint (N,) each of them is, -1 for none."""
+
+    features: Features
+    upright: IntArray
+
+
+@dataclass(frozen=True, slots=True)
 class Keyframe:
     """A frame that joins the map, as tracking hands it to mapping.
 
     landmark_ids (N,) int64, one per keypoint, `NO_LANDMARK` where there is none. `reference_matches` are the learned
-    matches to keyframe `reference_id` that tracking already has. The visibility counts are those of the frames since the last keyframe.
+    matches to keyframe `reference_id` that tracking already has. The visibility counts are those of the frames since the last keyframe. `turned` is there
+    where places are to be found again by a camera that has turned.
     """
 
     id: int
@@ -123,6 +132,7 @@ class Keyframe:
     map_id: int
     reference_matches: Matches | None = None
     seen: VisibilityCounts | None = None
+    turned: tuple[TurnedView, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

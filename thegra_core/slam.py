@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -32,8 +33,10 @@ from thegra_core.messages import (
     Snapshot,
     TrackingResult,
     TrackingState,
+    TurnedView,
 )
 from thegra_core.optimization.solver import BundleSolver
+from thegra_core.places.turning import turned_view
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
 from thegra_core.snapshots import SnapshotKeeper
@@ -89,6 +92,7 @@ class Slam:
         self._shutter = ShutterDetector(config.preprocessing.shutter)
         self._fixed_pattern = FixedPatternMask()
         self._masks = config.tracking.mask_fixed_pattern
+        self._rotations = config.loop.rotations
         self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
         self._matcher = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
         self._tracking = TrackingStage(camera, config, self._matcher)
@@ -224,20 +228,24 @@ class Slam:
             matches = self._matcher.match(features, reference) if reference is not None else None
             if reference is not None and matches is not None and self._masks:
                 matches = self._fixed_pattern.learn(features, reference, matches)
+        turned = functools.cache(lambda: self._turned(image, features))
         with self._timed("tracking"):
-            output = self._tracking.process(features, matches)
+            output = self._tracking.process(features, matches, turned)
         if output.dropped_map_id is not None:
             self._drop(output.dropped_map_id)
         with self._timed("mapping"):
             if output.initial_map is not None:
                 self._tracking.apply(self._mapper.initialize(output.initial_map))
             elif output.keyframe is not None:
-                update = self._mapper.insert(output.keyframe)
+                update = self._mapper.insert(replace(output.keyframe, turned=turned()))
                 self._tracking.apply(update)
                 self._follow(update)
         self._view = lambda: _snapshot(frame, image, features, output, reference)
         self._snapshots.offer(frame.index, self._view)
         return output
+
+    def _turned(self, image: NDArray[np.uint8], features: Features) -> tuple[TurnedView, ...]:
+        return tuple(turned_view(image, features, degrees // 90, self._extractor) for degrees in self._rotations)
 
     def _trouble(self, frame: Frame) -> str:
         """What is wrong with a frame, or an empty string."""
