@@ -105,11 +105,12 @@ class LocalEngine:
 
     def _slam_for(self, job: Job) -> Slam:
         if self._slam is None or job.epoch != self._epoch:
+            from thegra_core.optimization.solver import ProcessSolver
             from thegra_core.slam import Slam
 
             if self._networks is None:
                 self.start()
-            self._slam, self._epoch = Slam(job.camera, self._config, *(self._networks or ())), job.epoch
+            self._slam, self._epoch = Slam(job.camera, self._config, *(self._networks or ()), solver=ProcessSolver()), job.epoch
         return self._slam
 
 

@@ -124,7 +124,7 @@ def preprocessing(
 def growth(
     minutes: Annotated[float, typer.Option(min=0.1, metavar="MIN", help="Length of the walk.")] = 10.0,
     keypoints: Annotated[int, typer.Option(min=100, metavar="N", help="Keypoints of a frame, about.")] = 300,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for growth.json and growth.svg. Default: runs/growth_TIME.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for growth.json and growth.png. Default: runs/growth_TIME.")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter; repeatable. `thegra config` lists them.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
@@ -138,8 +138,7 @@ def growth(
     from thegra_core.config import load_config
     from thegra_core.evaluation.benchmark import growth as logic
 
-    assignments = dict(_assignment(text) for text in set_ or ())
-    config = load_config("quality", overrides={"preprocessing.filters": "[]"} | assignments)
+    config = load_config("quality", overrides={"preprocessing.filters": "[]"} | dict(_assignment(text) for text in set_ or ()))
     folder = out or Path("runs") / f"growth_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("walking", total=None)
@@ -151,7 +150,7 @@ def growth(
         return
     for name, value in told.items():
         print(f"{name:18} {value}")
-    print(f"figure             {folder / 'growth.svg'}")
+    print(f"figure             {folder / 'growth.png'}")
 
 
 def _assignment(text: str) -> tuple[str, str]:

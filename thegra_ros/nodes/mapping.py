@@ -12,6 +12,7 @@ from thegra_core.features.registry import make_matcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.messages import MapUpdate
+from thegra_core.optimization.solver import ProcessSolver
 from thegra_ros.camera_input import CameraInput
 from thegra_ros.camera_place import CameraPlace
 from thegra_ros.codec.clouds import Table
@@ -50,7 +51,7 @@ class MappingNode(StageNode):
         self._place.see(frame_id)
         if kind == "reset" or self._of is not self._camera.camera:
             self._of = self._camera.camera
-            self._mapper = Mapper(self._of, self.config, self._matcher) if self._of is not None else None
+            self._mapper = Mapper(self._of, self.config, self._matcher, ProcessSolver()) if self._of is not None else None
         if kind == "drop" and self._mapper is not None and int(tables[0].facts["map"]) in self._mapper.map_ids:
             self._mapper.drop(int(tables[0].facts["map"]))
         if kind in ("initial_map", "keyframe"):

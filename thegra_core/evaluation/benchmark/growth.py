@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 
 from thegra_core.config import ThegraConfig
 from thegra_core.messages import Frame, TrackingState
-from thegra_core.outputs.report.svg import BLUE, GREY, ORANGE, TEAL, draw
 from thegra_core.simulation.points import CAMERA, EqualDescriptors, PointStreet, StreetExtractor
 from thegra_core.slam import Slam
 
@@ -23,6 +22,7 @@ PARTS = 10
 """Equal parts of the run, of which the first with a settled map and the last are compared."""
 _SETTLED = 1
 _SMOOTHED = 50
+_DPI = 150
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,32 +79,29 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
 
 
 def write(samples: Sequence[Sample], folder: Path) -> None:
-    """growth.json with every frame, growth.svg with times and map size over the run."""
+    """growth.json with every frame, growth.png with times and map size over the run."""
     folder.mkdir(parents=True, exist_ok=True)
     columns = {name: [asdict(s)[name] for s in samples] for name in asdict(samples[0])}
     (folder / "growth.json").write_text(json.dumps({"summary": summary(samples), "frames": columns}), encoding="utf-8")
-    (folder / "growth.svg").write_text(figure(samples), encoding="utf-8")
+    figure(samples).savefig(folder / "growth.png", dpi=_DPI)
 
 
-def figure(samples: Sequence[Sample]) -> str:
+def figure(samples: Sequence[Sample]) -> Figure:
     """Running medians of tracking a frame and mapping a keyframe over the run, above the size of the map."""
     minutes = np.arange(len(samples)) * PERIOD_NS / 60e9
     keyframes = np.flatnonzero([s.is_keyframe for s in samples])
-
-    def paint(drawn: Figure) -> None:
-        times, sizes = drawn.subplots(2, 1, sharex=True)
-        times.plot(minutes, _running_median([s.tracking_ms for s in samples]), color=BLUE, label="tracking a frame")
-        times.plot(minutes[keyframes], _running_median([samples[i].mapping_ms for i in keyframes]), color=ORANGE, label="mapping a keyframe")
-        times.set_ylabel("ms")
-        times.set_ylim(bottom=0)
-        times.legend()
-        sizes.plot(minutes, [s.keyframes for s in samples], color=TEAL, label="keyframes")
-        sizes.plot(minutes, [s.rss_mb for s in samples], color=GREY, label="memory of the process / MB")
-        sizes.set_ylim(bottom=0)
-        sizes.set_xlabel("time of the recording / min")
-        sizes.legend()
-
-    return draw("cost and size of a growing map", (5.6, 4.4), paint)
+    drawn = Figure(figsize=(7, 5), layout="constrained")
+    times, sizes = drawn.subplots(2, 1, sharex=True)
+    times.plot(minutes, _running_median([s.tracking_ms for s in samples]), label="tracking a frame")
+    times.plot(minutes[keyframes], _running_median([samples[i].mapping_ms for i in keyframes]), label="mapping a keyframe")
+    times.set_ylabel("ms")
+    sizes.plot(minutes, [s.keyframes for s in samples], label="keyframes")
+    sizes.plot(minutes, [s.rss_mb for s in samples], label="memory of the process / MB")
+    sizes.set_xlabel("time of the recording / min")
+    for axes in (times, sizes):
+        axes.set_ylim(bottom=0)
+        axes.legend()
+    return drawn
 
 
 def _running_median(values: Sequence[float]) -> np.ndarray[Any, np.dtype[np.float64]]:
