@@ -268,6 +268,10 @@ class MappingConfig(Section):
     max_scale_ratio: float = Field(4.0, gt=1, description="distance of a new point in one view over that in the other")
     min_found_ratio: float = Field(0.25, ge=0, le=1, description="found / predicted visible below which a landmark is culled; paper: 25 %")
     trial_keyframes: int = Field(3, ge=1, description="keyframes after which a landmark must have trial_observations; ORB-SLAM3: 3")
+    redundant_share: float = Field(0.9, gt=0, le=1, description="share of a keyframe's landmarks that redundant_observers others must see from about as near for it to leave; ORB-SLAM3: 0.9")
+    redundant_observers: int = Field(3, ge=2, description="ORB-SLAM3: 3")
+    redundant_from: int = Field(200, ge=2, description="keyframes of a map from which on redundant ones leave")
+    max_keyframes: int = Field(3000, ge=10, description="keyframes of a map beyond which the most redundant ones leave in any case; about 1 MB each")
     trial_observations: int = Field(3, ge=2, description="observations a landmark must have by then; ORB-SLAM3: 3")
 
 
@@ -309,6 +313,8 @@ class LoopConfig(Section):
     max_scale_spread: float = Field(0.1, gt=0, description="median deviation of the logarithm of their depths' ratio")
     max_rotation_deg: float = Field(3.0, gt=0, description="degrees by which a second keyframe may place the loop otherwise")
     max_translation_ratio: float = Field(0.1, gt=0, description="the same in position, over the median depth")
+    rotations: tuple[Literal[90, 180, 270], ...] = Field((), description="degrees by which the image is also turned to find places again, for cameras that look at the ground and turn round; each costs an extraction a keyframe and a lost frame")
+    full_adjustment_after: int = Field(3, ge=1, description="keyframes after a loop or a merge from which on the result of the full adjustment is taken")
 
 
 class ThegraConfig(Section):

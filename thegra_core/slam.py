@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -25,13 +26,17 @@ from thegra_core.messages import (
     FrameRecord,
     MapSummary,
     MapUpdate,
+    Revisit,
     Run,
     Shutter,
     ShutterState,
     Snapshot,
     TrackingResult,
     TrackingState,
+    TurnedView,
 )
+from thegra_core.optimization.solver import BundleSolver
+from thegra_core.places.turning import turned_view
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
 from thegra_core.snapshots import SnapshotKeeper
@@ -74,28 +79,38 @@ class Slam:
 
     Args:
         keep_records: Remember every frame for `finish`. A live stream has no end and needs only the last one.
+        solver: Makes the full adjustments after loops and merges, see `Mapper`.
 
     Raises:
         WeightsError: If the configured networks' weights are not there.
     """
 
     def __init__(
-        self, camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None, keep_records: bool = True
+        self,
+        camera: CameraModel,
+        config: ThegraConfig,
+        extractor: Extractor | None = None,
+        matcher: Matcher | None = None,
+        *,
+        keep_records: bool = True,
+        solver: BundleSolver | None = None,
     ) -> None:
         self._camera = camera
         self._chain = Chain(config.preprocessing)
         self._shutter = ShutterDetector(config.preprocessing.shutter)
         self._fixed_pattern = FixedPatternMask()
         self._masks = config.tracking.mask_fixed_pattern
+        self._rotations = config.loop.rotations
         self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
         self._matcher = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
         self._tracking = TrackingStage(camera, config, self._matcher)
-        self._mapper = Mapper(camera, config, self._matcher)
+        self._mapper = Mapper(camera, config, self._matcher, solver)
         self._frames: list[_Placed] = []
         self._keep_records = keep_records
         self._last_stamp_ns: int | None = None
         self._backward, self._backward_ns = 0, None  # type: int, int | None
         self._bad: Counter[str] = Counter()
+        self._revisits: list[Revisit] = []
         self._closures: list[tuple[int, int]] = []
         self._snapshots = SnapshotKeeper()
         self._view: Callable[[], Snapshot] | None = None
@@ -203,6 +218,7 @@ class Slam:
             losses=self._tracking.losses,
             loops=self._mapper.loops,
             merges=self._mapper.merges,
+            revisits=tuple(self._revisits),
             relocalizations=self._tracking.relocalizations,
             bad_frames=dict(self._bad),
             snapshots=self._snapshots.kept(),
@@ -221,20 +237,24 @@ class Slam:
             matches = self._matcher.match(features, reference) if reference is not None else None
             if reference is not None and matches is not None and self._masks:
                 matches = self._fixed_pattern.learn(features, reference, matches)
+        turned = functools.cache(lambda: self._turned(image, features))
         with self._timed("tracking"):
-            output = self._tracking.process(features, matches)
+            output = self._tracking.process(features, matches, turned)
         if output.dropped_map_id is not None:
             self._drop(output.dropped_map_id)
         with self._timed("mapping"):
             if output.initial_map is not None:
                 self._tracking.apply(self._mapper.initialize(output.initial_map))
             elif output.keyframe is not None:
-                update = self._mapper.insert(output.keyframe)
+                update = self._mapper.insert(replace(output.keyframe, turned=turned()))
                 self._tracking.apply(update)
                 self._follow(update)
         self._view = lambda: _snapshot(frame, image, features, output, reference)
         self._snapshots.offer(frame.index, self._view)
         return output
+
+    def _turned(self, image: NDArray[np.uint8], features: Features) -> tuple[TurnedView, ...]:
+        return tuple(turned_view(image, features, degrees // 90, self._extractor) for degrees in self._rotations)
 
     def _trouble(self, frame: Frame) -> str:
         """What is wrong with a frame, or an empty string."""
@@ -277,7 +297,10 @@ class Slam:
         self._frames.append(_Placed(result, index, map_id, placed.reference_id, relative, afterwards=provisional is not None))
 
     def _follow(self, update: MapUpdate) -> None:
-        """Frames keep their place beside their keyframe when a loop changes the scale there, or their map becomes part of another."""
+        """Frames keep their place when their keyframe leaves the map, when a loop changes the scale there, or their map becomes part of another."""
+        self._revisits.extend(update.revisits)
+        if update.removed_keyframes:
+            self._inherit(update)
         absorbed = update.absorbed
         if not update.scales and absorbed is None:
             return
@@ -288,6 +311,18 @@ class Slam:
                 self._frames[row] = placed.scaled(absorbed.scale, update.map_id)
             elif placed.map_id == update.map_id:
                 self._frames[row] = placed.scaled(update.scales.get(placed.reference_id, 1.0), update.map_id)
+
+    def _inherit(self, update: MapUpdate) -> None:
+        removed = {r.id: r for r in update.removed_keyframes}
+        by_stamp = {r.stamp_ns: r for r in removed.values() if r.id >= self._first_keyframe_id}
+        map_id = update.map_id if update.absorbed is None else update.absorbed.map_id
+        for row, placed in enumerate(self._frames):
+            gone = removed.get(placed.reference_id)
+            if placed.reference_from_camera is not None and gone is not None:
+                self._frames[row] = replace(placed, reference_id=gone.heir_id, reference_from_camera=gone.heir_from_removed @ placed.reference_from_camera)
+            elif placed.may_be_placed and placed.result.stamp_ns in by_stamp:  # a frame of before the first map, which was this keyframe
+                gone = by_stamp[placed.result.stamp_ns]
+                self._frames[row] = replace(placed, map_id=map_id, reference_id=gone.heir_id, reference_from_camera=gone.heir_from_removed, afterwards=True)
 
     def _drop(self, map_id: int) -> None:
         """Forget a map and the places of frames in it."""

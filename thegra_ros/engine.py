@@ -164,11 +164,12 @@ class LocalEngine:
         return self._slam
 
     def _new(self, camera: CameraModel, home: Path | None) -> Slam:
+        from thegra_core.optimization.solver import ProcessSolver
         from thegra_core.slam import Slam
 
         if self._networks is None:
             self.start()
-        made = Slam(camera, self._config, *(self._networks or ()), keep_records=False)
+        made = Slam(camera, self._config, *(self._networks or ()), keep_records=False, solver=ProcessSolver())
         if home is not None:
             made.load_map(home)
         return made

@@ -67,6 +67,29 @@ def test_index_gives_places_seen_before_and_nothing_else():
     assert index.candidates(12, []) == []
 
 
+def test_a_removed_keyframe_is_found_no_more_and_the_others_as_before():
+    index, whole = (PlaceIndex(LoopConfig(vocabulary_keyframes=4, words=32), seed=0) for _ in range(2))
+    yaws = list(range(0, 360, 30))
+    for i, yaw in enumerate(yaws):
+        for one in (index, whole):
+            one.add(i, view(yaw, i))
+    for gone in (3, 11, 5, 99):
+        index.remove(gone)
+    left = [i for i in whole.query(view(92, 50), 99) if i not in (3, 11, 5)]
+    assert index.query(view(92, 50), 99) == left
+    index.add(30, view(91, 51))
+    assert index.query(view(92, 50), 1) == [30]
+    again = PlaceIndex(LoopConfig(), seed=0)
+    again.restore(index.arrays(), {})
+    assert again.query(view(92, 50), 99) == index.query(view(92, 50), 99)
+    waiting = PlaceIndex(LoopConfig(vocabulary_keyframes=4, words=32), seed=0)
+    for i in range(3):
+        waiting.add(i, view(30 * i, i))
+    waiting.remove(1)
+    waiting.add(3, view(90, 3))
+    assert waiting.query(view(0, 9), 9) == [], "three are too few for words"
+
+
 def place_map(scale=1.0, shift=(0.0, 0.0, 0.0)):
     """Two parts of a map that see the same wall: keyframes 0 to 2, and 10 and 11, which have drifted by a scale and a shift."""
     editor = MapEditor(0, CAMERA, covisibility_threshold=15)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -12,11 +13,12 @@ from thegra_core.config import ThegraConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.editor import MapEditor
-from thegra_core.mapping.adjustment import adjust_all
+from thegra_core.mapping.adjustment import adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
-from thegra_core.messages import NO_LANDMARK
+from thegra_core.messages import NO_LANDMARK, Revisit, TurnedView
 from thegra_core.optimization.pose_graph import Edge, optimize_pose_graph
 from thegra_core.places.index import PlaceIndex
+from thegra_core.places.turning import TurnedMatcher
 from thegra_core.places.verification import Sighting, agree, sight
 
 logger = logging.getLogger(__name__)
@@ -40,27 +42,29 @@ class LoopCloser:
     def __post_init__(self) -> None:
         self.index = PlaceIndex(self.config.loop, self.config.seed)
 
-    def look(self, editor: MapEditor, keyframe_id: int, graph: MatchGraph) -> bool:
-        """Whether a keyframe of the index, which mapping has finished with, closed a loop."""
-        sighting = self._find(editor, keyframe_id)
+    def look(self, editor: MapEditor, keyframe_id: int, graph: MatchGraph, turned: Sequence[TurnedView] = ()) -> bool:
+        """Whether a keyframe of the index, which mapping has finished with, closed a loop; `turned` are other views of it to look at."""
+        sighting = self._find(editor, keyframe_id, turned)
         before, self._waiting = self._waiting, sighting
-        if before is None or sighting is None or not agree(editor.map, before, sighting, self.config):
+        if before is None or sighting is None or not {before.keyframe_id, *before.matches} <= editor.map.keyframes.keys() or not agree(editor.map, before, sighting, self.config):
             return False
         _close(editor, [before, sighting], graph, self.config)
         self._waiting = None
         self.closed += 1
         return True
 
-    def _find(self, editor: MapEditor, keyframe_id: int) -> Sighting | None:
+    def _find(self, editor: MapEditor, keyframe_id: int, turned: Sequence[TurnedView]) -> Sighting | None:
         current = editor.map
         direct = current.neighbours(keyframe_id, len(current.keyframes))
         connected = list(dict.fromkeys([*direct, *(second for first in direct for second in current.neighbours(first, len(current.keyframes)))]))
-        for candidate in self.index.candidates(keyframe_id, connected)[:1]:
-            near = [i for i in current.neighbours(candidate, len(current.keyframes)) if i not in connected]
-            found = sight(current, keyframe_id, current, [candidate, *near[: self.config.loop.group - 1]], self.matcher, self.config)
-            if isinstance(found, Sighting):
-                return found
-            logger.debug("keyframe %d looks like %d: %s", keyframe_id, candidate, found)
+        for view in (None, *turned):
+            matcher = self.matcher if view is None else TurnedMatcher(self.matcher, view)
+            for candidate in self.index.candidates(keyframe_id, connected, None if view is None else view.features)[:1]:
+                near = [i for i in current.neighbours(candidate, len(current.keyframes)) if i not in connected]
+                found = sight(current, keyframe_id, current, [candidate, *near[: self.config.loop.group - 1]], matcher, self.config)
+                if isinstance(found, Sighting):
+                    return found
+                logger.debug("keyframe %d looks like %d: %s", keyframe_id, candidate, found)
         return None
 
 
@@ -78,12 +82,14 @@ def _close(editor: MapEditor, sightings: list[Sighting], graph: MatchGraph, conf
     concerned = {i for sighting in sightings for i in (sighting.keyframe_id, *sighting.matches)}
     for keyframe_id in sorted(concerned | {n for i in concerned for n in current.neighbours(i, ESSENTIAL_NEIGHBOURS)}):
         editor.connect(keyframe_id)
-    adjust_all(editor, config)
     last = sightings[-1]
-    moved = np.linalg.norm(current.keyframes[last.keyframe_id].center - before[last.keyframe_id].rigid[:3, 3]) / depth
+    adjust_both_sides(editor, last, config)
+    moved = float(np.linalg.norm(current.keyframes[last.keyframe_id].center - before[last.keyframe_id].rigid[:3, 3])) / depth
+    keyframe, old_id, scale = current.keyframes[last.keyframe_id], next(iter(last.matches)), last.world_from_camera.scale
+    editor.note(Revisit(keyframe.stamp_ns, current.map_id, keyframe.id, old_id, len(last.keypoints), moved, scale))
     logger.info(
         "loop closed: keyframe %d sees what keyframe %d saw, by %d landmarks; it moves by %.3f of the scene's depth, scale %.3f",
-        last.keyframe_id, next(iter(last.matches)), len(last.keypoints), moved, last.world_from_camera.scale,
+        keyframe.id, old_id, len(last.keypoints), moved, scale,
     )  # fmt: skip
 
 
@@ -105,7 +111,7 @@ def _move(editor: MapEditor, before: dict[int, Similarity], after: dict[int, Sim
     current = editor.map
     ids = current.landmarks.alive_ids()
     points = current.landmarks.points_world[current.landmarks.rows(ids)].copy()
-    carriers = np.array([_carrier(editor, i) for i in ids.tolist()], dtype=np.int64)
+    carriers = np.array([editor.carrier(i) for i in ids.tolist()], dtype=np.int64)
     for carrier in np.unique(carriers).tolist():
         mine = carriers == carrier
         points[mine] = (after[carrier] @ before[carrier].inverse()).apply(points[mine])
@@ -113,9 +119,11 @@ def _move(editor: MapEditor, before: dict[int, Similarity], after: dict[int, Sim
     editor.move(keyframes, np.stack([after[i].rigid for i in keyframes.tolist()]), ids, points)
 
 
-def _carrier(editor: MapEditor, landmark: int) -> int:
-    first = editor.first_keyframe[landmark]
-    return first if first in editor.map.keyframes else min(editor.observers[landmark])
+def adjust_both_sides(editor: MapEditor, sighting: Sighting, config: ThegraConfig) -> None:
+    """Local adjustments where an old place and a new one have met."""
+    for keyframe_id in (next(iter(sighting.matches)), sighting.keyframe_id):
+        adjust_locally(editor, keyframe_id, config)
+        editor.connect(keyframe_id)
 
 
 def fuse_sighting(editor: MapEditor, sighting: Sighting) -> None:

@@ -27,6 +27,7 @@ class PlaceIndex:
         self._waiting: dict[int, Features] = {}
         self._vocabulary: FloatArray | None = None
         self._rows: dict[int, int] = {}
+        self._ids: list[int] = []
         self._vectors = np.empty((0, 0), np.float32)
 
     def add(self, keyframe_id: int, features: Features) -> None:
@@ -42,36 +43,54 @@ class PlaceIndex:
             return
         self._append(keyframe_id, features)
 
+    def remove(self, keyframe_id: int) -> None:
+        """Forget a keyframe, if it is there."""
+        self._waiting.pop(keyframe_id, None)
+        row = self._rows.pop(keyframe_id, None)
+        if row is None:
+            return
+        last = self._ids.pop()
+        if last != keyframe_id:
+            self._vectors[row] = self._vectors[len(self._ids)]
+            self._ids[row], self._rows[last] = last, row
+
     def query(self, features: Features, most: int) -> list[int]:
         """At most `most` keyframes that look most like an image that is none of them, the most similar first."""
         if self._vocabulary is None:
             return []
         return _ranked(self._similar(describe(features, self._vocabulary)))[:most]
 
-    def alike(self, features: Features, near: Sequence[Features]) -> list[int]:
-        """Keyframes that look nearly as much like an image that is none of them as the first images of `near` it do, the most similar first."""
+    def alike(self, features: Features, near: Sequence[Features], turned: Features | None = None) -> list[int]:
+        """Keyframes that look nearly as much like an image that is none of them as the first images of `near` it do, the most similar first.
+
+        turned: as for `candidates`.
+        """
         if self._vocabulary is None:
             return []
         vector = describe(features, self._vocabulary)
-        return self._above_bar(self._similar(vector), [float(vector @ describe(other, self._vocabulary)) for other in near[:NEAR]])
+        similar = self._similar(vector if turned is None else describe(turned, self._vocabulary))
+        return self._above_bar(similar, [float(vector @ describe(other, self._vocabulary)) for other in near[:NEAR]])
 
-    def candidates(self, keyframe_id: int, connected: Sequence[int]) -> list[int]:
+    def candidates(self, keyframe_id: int, connected: Sequence[int], turned: Features | None = None) -> list[int]:
         """Keyframes that look nearly as much like this one as those do that see the same, the most similar first.
 
-        connected: ids that are no news, those that share most with it first.
+        connected: ids that are no news, those that share most with it first. turned: look for what looks like this view of it, by the same bar.
         """
-        if keyframe_id not in self._rows:
+        if keyframe_id not in self._rows or self._vocabulary is None:
             return []
         similar = self._similar(self._vectors[self._rows[keyframe_id]])
         del similar[keyframe_id]
-        near = [similar.pop(i) for i in connected if i in similar]
-        return self._above_bar(similar, near[:NEAR])
+        near = [similar.pop(i) for i in connected if i in similar][:NEAR]
+        if turned is not None:
+            as_turned = self._similar(describe(turned, self._vocabulary))
+            similar = {i: as_turned[i] for i in similar}
+        return self._above_bar(similar, near)
 
     def arrays(self) -> Arrays:
         """Words and vectors for a map file; nothing before there are words."""
         if self._vocabulary is None:
             return {}
-        return {"vocabulary": self._vocabulary, "ids": np.array(list(self._rows), dtype=np.int64), "vectors": self._vectors[: len(self._rows)]}
+        return {"vocabulary": self._vocabulary, "ids": np.array(self._ids, dtype=np.int64), "vectors": self._vectors[: len(self._ids)]}
 
     def restore(self, arrays: Arrays, features: Mapping[int, Features]) -> None:
         """Take what `arrays` gave, of the keyframes whose features are given by id."""
@@ -81,11 +100,12 @@ class PlaceIndex:
             return
         self._waiting.clear()
         self._vocabulary, self._vectors = arrays["vocabulary"], arrays["vectors"]
-        self._rows = {keyframe_id: row for row, keyframe_id in enumerate(arrays["ids"].tolist())}
+        self._ids = arrays["ids"].tolist()
+        self._rows = {keyframe_id: row for row, keyframe_id in enumerate(self._ids)}
 
     def _similar(self, vector: FloatArray) -> dict[int, float]:
         """Cosine of every keyframe's vector with a vector."""
-        return dict(zip(self._rows, (self._vectors[: len(self._rows)] @ vector).tolist(), strict=True))
+        return dict(zip(self._ids, (self._vectors[: len(self._ids)] @ vector).tolist(), strict=True))
 
     def _above_bar(self, similar: dict[int, float], near: list[float]) -> list[int]:
         if not near:
@@ -96,7 +116,7 @@ class PlaceIndex:
     def _append(self, keyframe_id: int, features: Features) -> None:
         assert self._vocabulary is not None
         vector = describe(features, self._vocabulary)
-        count = len(self._rows)
+        count = len(self._ids)
         if count == len(self._vectors):
             grown = np.zeros((max(64, 2 * count), len(vector)), np.float32)
             if count:
@@ -104,6 +124,7 @@ class PlaceIndex:
             self._vectors = grown
         self._vectors[count] = vector
         self._rows[keyframe_id] = count
+        self._ids.append(keyframe_id)
 
 
 def _ranked(similar: dict[int, float]) -> list[int]:

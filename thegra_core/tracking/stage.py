@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,9 +26,11 @@ from thegra_core.messages import (
     Matches,
     TrackingResult,
     TrackingState,
+    TurnedView,
     VisibilityCounts,
 )
 from thegra_core.places.index import PlaceIndex
+from thegra_core.places.turning import TurnedMatcher
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
 from thegra_core.tracking.motion import MotionModel
@@ -91,6 +94,8 @@ class _Place:
 
     def take(self, update: MapUpdate) -> None:
         self.map.apply(update)
+        for removed in update.removed_keyframes:
+            self.places.remove(removed.id)
         for message in update.new_keyframes:
             self.places.add(message.id, message.features)
 
@@ -135,8 +140,8 @@ class TrackingStage:
     def map_id(self) -> int:
         return self._place.map.map_id if self._place is not None else -1
 
-    def process(self, features: Features, matches: Matches | None) -> TrackingOutput:
-        """Track one frame; `matches` are to `reference_features` (None: not matched yet)."""
+    def process(self, features: Features, matches: Matches | None, turned: Callable[[], Sequence[TurnedView]] = tuple) -> TrackingOutput:
+        """Track one frame; `matches` are to `reference_features` (None: not matched yet). `turned` gives other views of it, asked for where it is not found."""
         place = self._place
         if place is None:
             return self._start(features, matches)
@@ -144,7 +149,7 @@ class TrackingStage:
             matches = self._matcher.match(features, place.reference)
         found = localize(place.map, features, place.reference_id, {place.reference_id: matches}, place.predict(features.stamp_ns), self._config)
         if isinstance(found, str):
-            return self._recover(place, features, matches, found)
+            return self._recover(place, features, matches, found, turned)
         return self._accept(place, features, found, matches)
 
     def hold(self, stamp_ns: int, reason: str) -> TrackingOutput:
@@ -310,20 +315,18 @@ class TrackingStage:
         self._next_keyframe_id += 1
         return keyframe
 
-    def _recover(self, place: _Place, features: Features, matches: Matches, reason: str) -> TrackingOutput:
+    def _recover(
+        self, place: _Place, features: Features, matches: Matches, reason: str, turned: Callable[[], Sequence[TurnedView]]
+    ) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
         if place.probation:
             dropped = self._drop()
             logger.info("map %s did not stand its probation: %s", dropped, reason)
             output = self._start(features, None) if self._place is None else self._stay_lost(self._place, features, reason)
             return replace(output, dropped_map_id=dropped)
-        settings = self._config.relocalization
-        if place.lost_frames == 0:
-            candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
-        else:
-            candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
-        least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
-        found = relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
+        found = self._seek(place, features, matches)
+        if found is None:
+            found = next(filter(None, (self._seek(place, features, None, view) for view in turned())), None)
         if found is not None:
             place.reference_id = found[1]
             return self._accept(place, features, found[0], found[2])
@@ -333,6 +336,23 @@ class TrackingStage:
             result = TrackingResult(features.stamp_ns, TrackingState.RELOCALIZING, keypoints=len(features), map_id=place.map.map_id, reason=reason)
             return TrackingOutput(result)
         return self._stay_lost(place, features, reason)
+
+    def _seek(
+        self, place: _Place, features: Features, matches: Matches | None, view: TurnedView | None = None
+    ) -> tuple[Localization, int, Matches] | None:
+        """Match a frame to the last keyframes or, once it is lost, to those that look most alike; as it is, with the matches to the reference there are, or as turned."""
+        settings = self._config.relocalization
+        if place.lost_frames == 0:
+            candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
+        else:
+            looks = features if view is None else view.features
+            candidates = similar_keyframes(place.map, place.places, looks, place.reference_id, settings.keyframes)
+        if view is not None:
+            candidates = [place.reference_id, *candidates]
+        least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
+        matcher = self._matcher if view is None else TurnedMatcher(self._matcher, view)
+        known = {place.reference_id: matches} if matches is not None else {}
+        return relocalize(place.map, features, candidates, matcher, self._config, least, known)
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:
