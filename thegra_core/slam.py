@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
 from thegra_core.errors import InputError
-from thegra_core.features.protocols import Extractor, Matcher
+from thegra_core.features.front_end import DetectAndFollow, DetectEach
+from thegra_core.features.protocols import Extractor, FrontEnd, Matcher, Wanted
 from thegra_core.features.registry import make_extractor, make_matcher
+from thegra_core.features.tracks import TrackMatcher, shared_tracks
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
@@ -25,6 +27,7 @@ from thegra_core.messages import (
     FrameRecord,
     MapSummary,
     MapUpdate,
+    Matches,
     Run,
     Shutter,
     ShutterState,
@@ -84,6 +87,10 @@ class Slam:
         self._masks = config.tracking.mask_fixed_pattern
         self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
         self._matcher = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
+        self._front_end: FrontEnd = DetectEach(self._extractor)
+        if config.flow.enabled:
+            self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
+            self._matcher = TrackMatcher(self._matcher, config.flow.min_shared)
         self._tracking = TrackingStage(camera, config, self._matcher)
         self._mapper = Mapper(camera, config, self._matcher)
         self._frames: list[_Placed] = []
@@ -114,6 +121,8 @@ class Slam:
             if shutter.recalibrated:
                 self._chain.reset()
                 self._fixed_pattern.forget()
+            if shutter.shutter is not Shutter.OPEN:
+                self._front_end.forget()
             if shutter.shutter is Shutter.JUST_OPENED:
                 self._tracking.reopen()
             output = self._tracking.hold(frame.stamp_ns, shutter.reason) if shutter.shutter is Shutter.CLOSED else self._see(frame)
@@ -207,16 +216,8 @@ class Slam:
     def _see(self, frame: Frame) -> TrackingOutput:
         with self._timed("preprocessing"):
             image = self._chain(frame.image, frame.stamp_ns)
-        with self._timed("extraction"):
-            features = self._extractor.extract(image, frame.stamp_ns)
-            features = self._fixed_pattern.apply(features)
         reference = self._tracking.reference_features
-        with self._timed("matching"):
-            matches = self._matcher.match(features, reference) if reference is not None else None
-            if reference is not None and matches is not None and self._masks:
-                matches = self._fixed_pattern.learn(features, reference, matches)
-        with self._timed("tracking"):
-            output = self._tracking.process(features, matches)
+        features, output = self._front(image, frame.stamp_ns, reference)
         if output.dropped_map_id is not None:
             self._drop(output.dropped_map_id)
         with self._timed("mapping"):
@@ -229,6 +230,30 @@ class Slam:
         self._view = lambda: _snapshot(frame, image, features, output, reference)
         self._snapshots.offer(frame.index, self._view)
         return output
+
+    def _front(self, image: NDArray[np.uint8], stamp_ns: int, reference: Features | None) -> tuple[Features, TrackingOutput]:
+        """Features of the image and what tracking made of them: of those followed, if there are any and they suffice, else of what is detected."""
+        with self._timed("flow"):
+            followed = self._front_end.follow(image, stamp_ns)
+        wanted = Wanted.MORE
+        if followed is not None:
+            features = self._fixed_pattern.apply(followed)
+            with self._timed("matching"):
+                matches = self._unmasked(features, reference, shared_tracks(features, reference)) if reference is not None else None
+            with self._timed("tracking"):
+                output = self._tracking.process_followed(features, matches)
+            if isinstance(output, TrackingOutput):
+                return features, output
+            wanted = output
+        with self._timed("extraction"):
+            features = self._fixed_pattern.apply(self._front_end.detect(wanted))
+        with self._timed("matching"):
+            matches = self._unmasked(features, reference, self._matcher.match(features, reference)) if reference is not None else None
+        with self._timed("tracking"):
+            return features, self._tracking.process(features, matches)
+
+    def _unmasked(self, features: Features, reference: Features, matches: Matches) -> Matches:
+        return self._fixed_pattern.learn(features, reference, matches) if self._masks else matches
 
     def _trouble(self, frame: Frame) -> str:
         """What is wrong with a frame, or an empty string."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
-from thegra_core.features.protocols import Matcher
+from thegra_core.features.protocols import Matcher, Wanted
 from thegra_core.geometry import poses
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.geometry.similarity import Similarity
@@ -28,6 +28,7 @@ from thegra_core.messages import (
     VisibilityCounts,
 )
 from thegra_core.places.index import PlaceIndex
+from thegra_core.tracking.followed import TrackLandmarks, localize_followed
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
 from thegra_core.tracking.motion import MotionModel
@@ -84,6 +85,7 @@ class _Place:
     motion: MotionModel = field(default_factory=MotionModel)
     visible: list[IntArray] = field(default_factory=list)
     found: list[IntArray] = field(default_factory=list)
+    tracks: TrackLandmarks = field(default_factory=TrackLandmarks)
 
     @property
     def reference(self) -> Features:
@@ -93,6 +95,9 @@ class _Place:
         self.map.apply(update)
         for message in update.new_keyframes:
             self.places.add(message.id, message.features)
+        for state in update.keyframes:
+            if state.id == self.last_keyframe_id:
+                self.tracks.overlay(self.map.keyframes[state.id].features, state.landmark_ids)
 
     def predict(self, stamp_ns: int) -> FloatArray | None:
         return self.motion.predict(stamp_ns) if self.lost_frames == 0 else None
@@ -147,6 +152,26 @@ class TrackingStage:
             return self._recover(place, features, matches, found)
         return self._accept(place, features, found, matches)
 
+    def process_followed(self, features: Features, matches: Matches | None) -> TrackingOutput | Wanted:
+        """Track one frame by keypoints that were followed to it; `matches` as for `process`.
+
+        Instead of an answer, what `process` should get of the same image: more features if a keyframe is due, other ones if these give no pose.
+        """
+        place = self._place
+        if place is None:
+            return self._start(features, matches)
+        if place.lost_frames or place.search_frames:
+            return Wanted.ANEW
+        assert features.track_ids is not None
+        landmark_ids = place.tracks.of(features.track_ids)
+        found = localize_followed(place.map, features, landmark_ids, place.predict(features.stamp_ns), self._config)
+        if isinstance(found, str):
+            logger.debug("followed keypoints at %.3f s: %s", features.stamp_ns / 1e9, found)
+            return Wanted.ANEW
+        if self._keyframe_due(place, found):
+            return Wanted.MORE
+        return self._accept_followed(place, features, found, matches)
+
     def hold(self, stamp_ns: int, reason: str) -> TrackingOutput:
         """A frame that shows nothing (shutter closed): the pose is predicted, and marked as that; not for longer than a closure can last."""
         place = self._place
@@ -191,6 +216,7 @@ class TrackingStage:
         if before:
             newest = max(before)
             place.reference_id = place.last_keyframe_id = newest
+            place.tracks.overlay(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
             corrected = Similarity(place.map.keyframes[newest].world_from_camera, update.scales.get(newest, 1.0))
             place.motion.move(corrected @ Similarity(before[newest]).inverse())
 
@@ -202,7 +228,8 @@ class TrackingStage:
         place.map, place.places = Map(update.map_id, self._camera), self._place_index()
         place.take(update)
         place.motion.move(Similarity(absorbed.rigid, absorbed.scale))
-        place.reference_id = place.last_keyframe_id = max(m.id for m in update.new_keyframes)
+        place.reference_id = place.last_keyframe_id = newest = max(m.id for m in update.new_keyframes)
+        place.tracks.replace(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
         place.probation, self._before = 0, None
         place.visible, place.found = [], []
 
@@ -262,22 +289,35 @@ class TrackingStage:
             self.relocalizations += 1
             place.motion.reset()
         place.search_frames = 0
-        place.probation = max(0, place.probation - 1)
-        world_from_camera = found.world_from_camera
-        place.motion.update(features.stamp_ns, world_from_camera, found.covariance)
-        if not self.localization_only:
-            place.visible.append(found.visible_ids)
-            place.found.append(found.landmark_ids[found.landmark_ids >= 0])
+        self._note(place, features, found)
+        place.tracks.replace(features, found.landmark_ids)
         matched_to = place.reference_id
         keyframe = self._as_keyframe(place, features, found, matches)
         if keyframe is None:
             local = place.map.local_keyframes(place.reference_id, self._config.tracking.local_keyframes)
             place.reference_id = best_reference(place.map, found.landmark_ids, local)
-        result = TrackingResult(
-            features.stamp_ns, TrackingState.TRACKING, world_from_camera, found.covariance, place.motion.twist(), len(features), found.matches,
-            found.inliers, len(found.visible_ids), keyframe is not None, place.map.map_id, keyframe.id if keyframe is not None else matched_to,
-        )  # fmt: skip
+        result = self._result(place, features, found, keyframe.id if keyframe is not None else matched_to, keyframe is not None)
         return self._claim(place, features, TrackingOutput(result, keyframe, landmark_ids=found.landmark_ids, matches=matches))
+
+    def _accept_followed(self, place: _Place, features: Features, found: Localization, matches: Matches | None) -> TrackingOutput:
+        self._note(place, features, found)
+        result = self._result(place, features, found, place.reference_id, is_keyframe=False)
+        return self._claim(place, features, TrackingOutput(result, landmark_ids=found.landmark_ids, matches=matches))
+
+    def _note(self, place: _Place, features: Features, found: Localization) -> None:
+        """A frame was placed: motion goes on from it, and its landmarks were seen."""
+        place.probation = max(0, place.probation - 1)
+        place.motion.update(features.stamp_ns, found.world_from_camera, found.covariance)
+        if not self.localization_only:
+            place.visible.append(found.visible_ids)
+            place.found.append(found.landmark_ids[found.landmark_ids >= 0])
+
+    @staticmethod
+    def _result(place: _Place, features: Features, found: Localization, reference_id: int, is_keyframe: bool) -> TrackingResult:
+        return TrackingResult(
+            features.stamp_ns, TrackingState.TRACKING, found.world_from_camera, found.covariance, place.motion.twist(), len(features), found.matches,
+            found.inliers, len(found.visible_ids), is_keyframe, place.map.map_id, reference_id,
+        )  # fmt: skip
 
     def _claim(self, place: _Place, features: Features, output: TrackingOutput) -> TrackingOutput:
         """The output as it may be told: a pose only once the map has stood its probation."""
@@ -293,12 +333,7 @@ class TrackingStage:
 
     def _as_keyframe(self, place: _Place, features: Features, found: Localization, matches: Matches) -> Keyframe | None:
         """The frame as a keyframe message if one is due."""
-        if self.localization_only:
-            return None
-        last, reference = place.map.keyframes[place.last_keyframe_id], place.map.keyframes[place.reference_id]
-        tracked_ratio = found.inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
-        depth = place.map.median_depth(place.reference_id, found.world_from_camera)
-        if not needs_keyframe(last.world_from_camera, found.world_from_camera, depth, tracked_ratio, self._config.keyframe):
+        if not self._keyframe_due(place, found):
             return None
         keyframe = Keyframe(
             self._next_keyframe_id, features.stamp_ns, found.world_from_camera, features, found.landmark_ids, place.reference_id, place.map.map_id,
@@ -306,6 +341,14 @@ class TrackingStage:
         )  # fmt: skip
         self._next_keyframe_id += 1
         return keyframe
+
+    def _keyframe_due(self, place: _Place, found: Localization) -> bool:
+        if self.localization_only:
+            return False
+        last, reference = place.map.keyframes[place.last_keyframe_id], place.map.keyframes[place.reference_id]
+        tracked_ratio = found.inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
+        depth = place.map.median_depth(place.reference_id, found.world_from_camera)
+        return bool(needs_keyframe(last.world_from_camera, found.world_from_camera, depth, tracked_ratio, self._config.keyframe))
 
     def _recover(self, place: _Place, features: Features, matches: Matches, reason: str) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
