@@ -269,6 +269,7 @@ class KeyframeConfig(Section):
     rotation_deg: float = Field(15.0, gt=0, description="degrees since the last keyframe; paper: 15")
     translation_ratio: float = Field(0.03, gt=0, description="displacement over median depth; paper: 0.03")
     min_tracked_ratio: float = Field(0.5, ge=0, le=1, description="landmarks tracked over those of the reference keyframe; below it a keyframe is due; 0: off, as in the paper")
+    most_pending: int = Field(2, ge=1, description="keyframes that wait for mapping, where it runs in a process of its own; none is made while so many do")
 
 
 class MappingConfig(Section):

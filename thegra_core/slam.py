@@ -1,4 +1,4 @@
-"""The whole system: four stages wired in one thread, frame by frame, deterministic."""
+"""The whole system: four stages wired frame by frame; in one thread, deterministic, or with mapping beside it in a process of its own."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
-from thegra_core.errors import InputError
 from thegra_core.features.front_end import DetectAndFollow, DetectEach
 from thegra_core.features.protocols import Extractor, FrontEnd, Matcher, Wanted
-from thegra_core.features.registry import make_extractor, make_matcher
-from thegra_core.features.tracks import TrackMatcher, shared_tracks
+from thegra_core.features.registry import make_extractor, make_frame_matcher
+from thegra_core.features.tracks import shared_tracks
 from thegra_core.geometry.camera import CameraModel
-from thegra_core.map.map import Map
+from thegra_core.map.map import Map, summarize
 from thegra_core.mapping.mapper import Mapper
+from thegra_core.mapping.process import MappingProcess
+from thegra_core.mapping.service import InlineMapping, MappingService
 from thegra_core.messages import (
     Features,
     Frame,
@@ -75,24 +76,31 @@ class _Placed:
 class Slam:
     """Frames in, poses out; `finish` gives the account of the run.
 
+    Args:
+        extractor, matcher: Instead of those configured.
+        beside: Map in a process of its own, with the matcher configured: `process` never waits for it, and what becomes of a run depends on the machine.
+
     Raises:
         WeightsError: If the configured networks' weights are not there.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None) -> None:
+    def __init__(
+        self, camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None, beside: bool = False
+    ) -> None:
         self._camera = camera
         self._chain = Chain(config.preprocessing)
         self._shutter = ShutterDetector(config.preprocessing.shutter)
         self._fixed_pattern = FixedPatternMask()
         self._masks = config.tracking.mask_fixed_pattern
         self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
-        self._matcher = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
+        self._matcher = make_frame_matcher(config, matcher)
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
-            self._matcher = TrackMatcher(self._matcher, config.flow.min_shared)
         self._tracking = TrackingStage(camera, config, self._matcher)
-        self._mapper = Mapper(camera, config, self._matcher)
+        self._mapping: MappingService = (
+            MappingProcess(camera, config, make_frame_matcher) if beside else InlineMapping(Mapper(camera, config, self._matcher))
+        )
         self._frames: list[_Placed] = []
         self._last_stamp_ns: int | None = None
         self._backward, self._backward_ns = 0, None  # type: int, int | None
@@ -146,7 +154,7 @@ class Slam:
         Raises:
             InputError: If the file is not there, not whole, or of another version, camera or extractor.
         """
-        update = self._mapper.load(path)
+        update = self._mapping.load(path)
         self._tracking.resume(update)
         self._first_keyframe_id = 1 + max(m.id for m in update.new_keyframes)
 
@@ -156,9 +164,7 @@ class Slam:
         Raises:
             InputError: If there is no map yet, or the file cannot be written.
         """
-        if not self._mapper.map_ids:
-            raise InputError(f"there is no map yet that could be written to {path}")
-        self._mapper.save(max(self._mapper.map_ids, key=lambda i: (len(self._mapper.map(i).keyframes), -i)), path)
+        self._mapping.save(path)
 
     def snapshot(self) -> Snapshot | None:
         """Image, keypoints and tracks of the last frame; None if it was bad or the shutter was closed."""
@@ -166,14 +172,12 @@ class Slam:
 
     def map_size(self) -> tuple[int, int]:
         """Keyframes and landmarks of the map being tracked."""
-        if self._tracking.map_id < 0:
-            return 0, 0
-        current = self._mapper.map(self._tracking.map_id)
-        return len(current.keyframes), len(current.landmarks)
+        current = self._tracking.map
+        return (len(current.keyframes), len(current.landmarks)) if current is not None else (0, 0)
 
     def current_map(self) -> MapSummary | None:
         """A copy of what the map being tracked holds; None before the first map."""
-        return self._mapper.summary(self._tracking.map_id) if self._tracking.map_id >= 0 else None
+        return summarize(self._tracking.map) if self._tracking.map is not None else None
 
     def finish(self, progress: Callable[[str], None] | None = None) -> Run:
         """Full bundle adjustment, late localisation of frames without a pose, and the account of the run."""
@@ -181,11 +185,10 @@ class Slam:
         unproven = self._tracking.drop_unproven()
         if unproven is not None:
             self._drop(unproven)
-        say("full bundle adjustment")
-        for map_id in self._mapper.map_ids if not self.localization_only else ():
-            update = self._mapper.finish(map_id)
-            if map_id == self._tracking.map_id:
-                self._tracking.apply(update)
+        if not self.localization_only:
+            say("full bundle adjustment")
+            for update in self._mapping.finish():
+                self._take(update)
         say("placing frames that had no pose")
         late = {p.stamp_ns: p for p in self._tracking.localize_afterwards()}
         for row, placed in enumerate(self._frames):
@@ -194,18 +197,19 @@ class Slam:
                 self._frames[row] = replace(
                     placed, map_id=found.map_id, reference_id=found.reference_id, reference_from_camera=found.reference_from_camera, afterwards=True
                 )
-        maps = {map_id: self._mapper.map(map_id) for map_id in self._mapper.map_ids}
+        maps = {current.map_id: current for current in self._mapping.maps()}
+        loops, merges = self._mapping.counts()
         by_stamp = {(map_id, k.stamp_ns): k.id for map_id, m in maps.items() for k in m.keyframes.values() if k.id >= self._first_keyframe_id}
         records = tuple(self._final(placed, maps, by_stamp) for placed in self._frames)
         counts = Counter(r.map_id for r in records if r.world_from_camera is not None)
         return Run(
             frames=records,
-            maps=tuple(self._mapper.summary(i) for i in self._mapper.map_ids),
+            maps=tuple(summarize(current) for current in maps.values()),
             main_map_id=max(counts, key=lambda i: (counts[i], -i)) if counts else -1,
             shutter_closures_ns=tuple(self._closures),
             losses=self._tracking.losses,
-            loops=self._mapper.loops,
-            merges=self._mapper.merges,
+            loops=loops,
+            merges=merges,
             relocalizations=self._tracking.relocalizations,
             bad_frames=dict(self._bad),
             snapshots=self._snapshots.kept(),
@@ -222,11 +226,10 @@ class Slam:
             self._drop(output.dropped_map_id)
         with self._timed("mapping"):
             if output.initial_map is not None:
-                self._tracking.apply(self._mapper.initialize(output.initial_map))
+                self._mapping.initialize(output.initial_map)
             elif output.keyframe is not None:
-                update = self._mapper.insert(output.keyframe)
-                self._tracking.apply(update)
-                self._follow(update)
+                self._mapping.insert(output.keyframe)
+            self._take_updates()
         self._view = lambda: _snapshot(frame, image, features, output, reference)
         self._snapshots.offer(frame.index, self._view)
         return output
@@ -254,6 +257,14 @@ class Slam:
 
     def _unmasked(self, features: Features, reference: Features, matches: Matches) -> Matches:
         return self._fixed_pattern.learn(features, reference, matches) if self._masks else matches
+
+    def _take_updates(self) -> None:
+        for update in self._mapping.updates():
+            self._take(update)
+
+    def _take(self, update: MapUpdate) -> None:
+        self._tracking.apply(update)
+        self._follow(update)
 
     def _trouble(self, frame: Frame) -> str:
         """What is wrong with a frame, or an empty string."""
@@ -288,10 +299,8 @@ class Slam:
         if placed.state is not TrackingState.TRACKING or placed.world_from_camera is None:
             self._frames.append(_Placed(result, index, bad=bad))
             return
-        map_id = placed.map_id if placed.map_id in self._mapper.map_ids else self._tracking.map_id  # its map may just have become part of another
-        reference = self._mapper.map(map_id).keyframes[placed.reference_id]
-        relative = np.eye(4) if placed.is_keyframe else reference.camera_from_world @ placed.world_from_camera
-        self._frames.append(_Placed(result, index, map_id, placed.reference_id, relative, afterwards=provisional is not None))
+        reference_id, relative = self._tracking.relative_to_reference(placed)
+        self._frames.append(_Placed(result, index, self._tracking.map_id, reference_id, relative, afterwards=provisional is not None))
 
     def _follow(self, update: MapUpdate) -> None:
         """Frames keep their place beside their keyframe when a loop changes the scale there, or their map becomes part of another."""
@@ -308,12 +317,15 @@ class Slam:
 
     def _drop(self, map_id: int) -> None:
         """Forget a map and the places of frames in it."""
-        self._mapper.drop(map_id)
+        self._mapping.drop(map_id)
         self._frames = [_Placed(p.result, p.index, bad=p.bad) if p.map_id == map_id else p for p in self._frames]
 
     @staticmethod
     def _final(placed: _Placed, maps: dict[int, Map], keyframe_by_stamp: dict[tuple[int, int], int]) -> FrameRecord:
         """A frame carried by the final map; frames that became keyframes of a first map after their time have that keyframe's pose."""
+        itself = keyframe_by_stamp.get((placed.map_id, placed.result.stamp_ns)) if placed.reference_from_camera is not None else None
+        if itself is not None:
+            return FrameRecord(placed.index, placed.result, maps[placed.map_id].keyframes[itself].world_from_camera, placed.map_id, placed.afterwards)
         if placed.reference_from_camera is not None:
             pose = maps[placed.map_id].keyframes[placed.reference_id].world_from_camera @ placed.reference_from_camera
             return FrameRecord(placed.index, placed.result, pose, placed.map_id, placed.afterwards)

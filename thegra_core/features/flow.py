@@ -40,7 +40,8 @@ def normalize_contrast(image: Image) -> Image:
     size = (CONTRAST_WINDOW, CONTRAST_WINDOW)
     mean = cv2.boxFilter(values, -1, size)
     variance = cv2.boxFilter(values * values, -1, size) - mean * mean
-    return cv2.convertScaleAbs(128 + CONTRAST_LEVELS * (values - mean) / np.sqrt(np.maximum(variance, LEAST_VARIANCE)))
+    scaled = 128 + CONTRAST_LEVELS * (values - mean) / np.sqrt(np.maximum(variance, LEAST_VARIANCE))
+    return np.asarray(np.clip(scaled, 0, 255), np.uint8)
 
 
 def coarse_shift(before: Image, after: Image) -> NDArray[np.float32]:
@@ -49,7 +50,7 @@ def coarse_shift(before: Image, after: Image) -> NDArray[np.float32]:
     size = (max(width // COARSE, 8), max(height // COARSE, 8))
     small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) for image in (before, after)]
     shift, _ = cv2.phaseCorrelate(small[0] - small[0].mean(), small[1] - small[1].mean(), cv2.createHanningWindow(size, cv2.CV_32F))
-    return np.array(shift, np.float32) * (np.array([width, height], np.float32) / np.array(size, np.float32))
+    return np.asarray(np.array(shift) * (np.array([width, height]) / np.array(size)), np.float32)
 
 
 def follow(before: Image, after: Image, points: Points, start: Points, config: FlowConfig) -> Followed:
@@ -60,7 +61,8 @@ def follow(before: Image, after: Image, points: Points, start: Points, config: F
     if len(points) == 0:
         return Followed(np.empty((0, 2), np.float32), np.empty(0, bool), np.empty(0, np.float32))
     window, use_start = (config.window, config.window), cv2.OPTFLOW_USE_INITIAL_FLOW
-    there, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, start.copy(), winSize=window, maxLevel=config.levels, criteria=_STEPS, flags=use_start)
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, start.copy(), winSize=window, maxLevel=config.levels, criteria=_STEPS, flags=use_start)
+    there: Points = np.asarray(moved, np.float32)
     back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, points.copy(), winSize=window, maxLevel=1, criteria=_STEPS, flags=use_start)
     found = (status.ravel() > 0) & (status_back.ravel() > 0)
     found &= np.linalg.norm(back - points, axis=1) < config.max_back_px

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,7 +115,8 @@ def merged(followed: Features, detected: Features, near_px: float, most: int) ->
         return followed if len(detected) == 0 else detected
     distance, nearest = cKDTree(detected.keypoints).query(followed.keypoints)
     near = distance <= near_px
-    descriptors, scores = followed.descriptors.copy(), followed.scores.copy()
+    descriptors: NDArray[Any] = followed.descriptors.copy()
+    scores = followed.scores.copy()
     descriptors[near], scores[near] = detected.descriptors[nearest[near]], detected.scores[nearest[near]]
     away = np.flatnonzero(cKDTree(followed.keypoints).query(detected.keypoints)[0] > near_px)
     new = away[: max(most - len(followed), 0)]
@@ -123,7 +125,7 @@ def merged(followed: Features, detected: Features, near_px: float, most: int) ->
         detected.stamp_ns,
         np.concatenate((followed.keypoints, detected.keypoints[new])),
         np.concatenate((scores, detected.scores[new])),
-        np.concatenate((descriptors, detected.descriptors[new])),
+        np.concatenate((descriptors, np.asarray(detected.descriptors[new], descriptors.dtype))),
         detected.image_size,
         detected.extractor,
         np.concatenate((followed.track_ids, np.full(len(new), -1, np.int64))),

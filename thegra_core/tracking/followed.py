@@ -39,13 +39,13 @@ class TrackLandmarks:
         order = np.argsort(features.track_ids)
         self._ids, self._landmarks = features.track_ids[order], landmark_ids[order]
 
-    def overlay(self, features: Features, landmark_ids: IntArray) -> None:
-        """Take what mapping made of a keyframe's keypoints, for the tracks that go on."""
-        if features.track_ids is None or len(self._ids) == 0:
-            return
-        _, here, there = np.intersect1d(self._ids, features.track_ids, assume_unique=True, return_indices=True)
-        self._landmarks = self._landmarks.copy()
-        self._landmarks[here] = landmark_ids[there]
+    def take(self, features: Features, landmark_ids: IntArray) -> None:
+        """Take what mapping made of a keyframe's keypoints: for the tracks that go on, or, where none is known, for all."""
+        if len(self._ids) == 0:
+            self.replace(features, landmark_ids)
+        elif features.track_ids is not None:
+            _, here, there = np.intersect1d(self._ids, features.track_ids, assume_unique=True, return_indices=True)
+            self._landmarks[here] = landmark_ids[there]
 
 
 def localize_followed(

@@ -71,7 +71,8 @@ class LateLocalization:
 class _Place:
     """Where tracking is: a replica of a map and of its places, keyframes of it, and what has been seen since the last one.
 
-    resumed: the map was made in another run, so that its stamps say nothing about this one.
+    resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet, and
+    their poses.
     """
 
     map: Map
@@ -86,18 +87,30 @@ class _Place:
     visible: list[IntArray] = field(default_factory=list)
     found: list[IntArray] = field(default_factory=list)
     tracks: TrackLandmarks = field(default_factory=TrackLandmarks)
+    pending: dict[int, FloatArray] = field(default_factory=dict)
+
+    @property
+    def begun(self) -> bool:
+        """Whether mapping has made the first keyframes of the map."""
+        return self.reference_id in self.map.keyframes
 
     @property
     def reference(self) -> Features:
         return self.map.keyframes[self.reference_id].features
 
+    @property
+    def last_keyframe_pose(self) -> FloatArray:
+        return self.pending[max(self.pending)] if self.pending else self.map.keyframes[self.last_keyframe_id].world_from_camera
+
     def take(self, update: MapUpdate) -> None:
         self.map.apply(update)
+        for message in update.new_keyframes:
+            self.pending.pop(message.id, None)
         for message in update.new_keyframes:
             self.places.add(message.id, message.features)
         for state in update.keyframes:
             if state.id == self.last_keyframe_id:
-                self.tracks.overlay(self.map.keyframes[state.id].features, state.landmark_ids)
+                self.tracks.take(self.map.keyframes[state.id].features, state.landmark_ids)
 
     def predict(self, stamp_ns: int) -> FloatArray | None:
         return self.motion.predict(stamp_ns) if self.lost_frames == 0 else None
@@ -134,7 +147,14 @@ class TrackingStage:
     @property
     def reference_features(self) -> Features | None:
         """What the front end should match the next frame to."""
-        return self._initializer.reference_features if self._place is None else self._place.reference
+        if self._place is None:
+            return self._initializer.reference_features
+        return self._place.reference if self._place.begun else None
+
+    @property
+    def map(self) -> Map | None:
+        """The replica of the current map; read it and change nothing."""
+        return self._place.map if self._place is not None else None
 
     @property
     def map_id(self) -> int:
@@ -145,6 +165,8 @@ class TrackingStage:
         place = self._place
         if place is None:
             return self._start(features, matches)
+        if not place.begun:
+            return self._wait_for_map(place, features)
         if matches is None or matches.reference_stamp_ns != place.reference.stamp_ns:
             matches = self._matcher.match(features, place.reference)
         found = localize(place.map, features, place.reference_id, {place.reference_id: matches}, place.predict(features.stamp_ns), self._config)
@@ -160,6 +182,8 @@ class TrackingStage:
         place = self._place
         if place is None:
             return self._start(features, matches)
+        if not place.begun:
+            return self._wait_for_map(place, features)
         if place.lost_frames or place.search_frames:
             return Wanted.ANEW
         assert features.track_ids is not None
@@ -216,7 +240,7 @@ class TrackingStage:
         if before:
             newest = max(before)
             place.reference_id = place.last_keyframe_id = newest
-            place.tracks.overlay(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
+            place.tracks.take(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
             corrected = Similarity(place.map.keyframes[newest].world_from_camera, update.scales.get(newest, 1.0))
             place.motion.move(corrected @ Similarity(before[newest]).inverse())
 
@@ -231,7 +255,16 @@ class TrackingStage:
         place.reference_id = place.last_keyframe_id = newest = max(m.id for m in update.new_keyframes)
         place.tracks.replace(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
         place.probation, self._before = 0, None
-        place.visible, place.found = [], []
+        place.visible, place.found, place.pending = [], [], {}
+
+    def relative_to_reference(self, result: TrackingResult) -> tuple[int, FloatArray]:
+        """A keyframe of the current map and reference_from_camera (4, 4) of a result that has a pose; one that mapping does not know yet is its own."""
+        assert self._place is not None and result.world_from_camera is not None
+        keyframes = self._place.map.keyframes
+        if result.is_keyframe and (result.reference_id in keyframes or not self._place.begun):
+            return result.reference_id, np.eye(4)
+        reference_id = result.reference_id if result.reference_id in keyframes else self._place.reference_id
+        return reference_id, keyframes[reference_id].camera_from_world @ result.world_from_camera
 
     def drop_unproven(self) -> int | None:
         """At the end of a run: give up a map that is still on probation; its id, or None."""
@@ -263,6 +296,12 @@ class TrackingStage:
             result = TrackingResult(features.stamp_ns, TrackingState.INITIALIZING, keypoints=len(features), matches=len(matches or ()), reason=initial)
             return TrackingOutput(result, matches=matches)
         return self._begin_map(features, initial)
+
+    def _wait_for_map(self, place: _Place, features: Features) -> TrackingOutput:
+        """Mapping has not made the new map yet."""
+        self._unplaced.append(features)
+        state = TrackingState.INITIALIZING if self._before is None else TrackingState.LOST
+        return TrackingOutput(TrackingResult(features.stamp_ns, state, keypoints=len(features), map_id=place.map.map_id, reason="a new map is being made"))
 
     def _begin_map(self, features: Features, initial: InitialMap) -> TrackingOutput:
         last = initial.keyframes[-1]
@@ -340,15 +379,16 @@ class TrackingStage:
             matches, place.take_counts(),
         )  # fmt: skip
         self._next_keyframe_id += 1
+        place.pending[keyframe.id] = keyframe.world_from_camera
         return keyframe
 
     def _keyframe_due(self, place: _Place, found: Localization) -> bool:
-        if self.localization_only:
+        if self.localization_only or len(place.pending) >= self._config.keyframe.most_pending:
             return False
-        last, reference = place.map.keyframes[place.last_keyframe_id], place.map.keyframes[place.reference_id]
+        reference = place.map.keyframes[place.reference_id]
         tracked_ratio = found.inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
         depth = place.map.median_depth(place.reference_id, found.world_from_camera)
-        return bool(needs_keyframe(last.world_from_camera, found.world_from_camera, depth, tracked_ratio, self._config.keyframe))
+        return bool(needs_keyframe(place.last_keyframe_pose, found.world_from_camera, depth, tracked_ratio, self._config.keyframe))
 
     def _recover(self, place: _Place, features: Features, matches: Matches, reason: str) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
