@@ -1,10 +1,13 @@
-"""How this process uses the machine: threads and memory. Called once, where a process starts; nothing here changes a result."""
+"""How this process uses the machine: threads and memory. Called once, where a process starts; nothing here changes a result. And what it has used."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import sys
+import time
+from dataclasses import dataclass
 
 MOST_THREADS = 4
 """Of the networks by default; a keyframe's 1024 points do not fill more."""
@@ -41,3 +44,17 @@ def keep_freed_memory() -> None:
         return
     mallopt(_M_MMAP_THRESHOLD, _LARGEST_BYTES)
     mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What a process has used so far: seconds of all cores, and the most memory at a time in MiB."""
+
+    cpu_s: float = 0.0
+    peak_rss_mb: float = 0.0
+
+
+def own_usage() -> Usage:
+    """Usage of this process, without its children."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return Usage(time.process_time(), peak / (1 << 20) if sys.platform == "darwin" else peak / 1024)

@@ -38,6 +38,7 @@ from thegra_core.messages import (
 )
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
+from thegra_core.process import Usage
 from thegra_core.snapshots import SnapshotKeeper
 from thegra_core.tracking.fixed_pattern import FixedPatternMask
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
@@ -110,6 +111,23 @@ class Slam:
         self._view: Callable[[], Snapshot] | None = None
         self._stage_ms: dict[str, float] = {}
         self._first_keyframe_id = 0
+
+    def warm_up(self) -> None:
+        """Let everything that is made at its first use be made, and wait for the process of mapping: a live stream waits for nothing."""
+        width, height = self._camera.image_size
+        noise = np.random.default_rng(0).integers(0, 255, (height, width), np.uint8)
+        features = self._extractor.extract(self._chain(noise, 0), 0)
+        self._matcher.match(features, features)
+        self._chain.reset()
+        self._mapping.usage()
+
+    def usage(self) -> Usage:
+        """What processes beside this one have used."""
+        return self._mapping.usage()
+
+    def close(self) -> None:
+        """End what runs beside this process; nothing else can be called afterwards."""
+        self._mapping.close()
 
     def process(self, frame: Frame) -> TrackingResult:
         """One frame through all stages; never raises for what an image holds. Bad frames are counted and change nothing."""

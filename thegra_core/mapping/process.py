@@ -27,12 +27,14 @@ from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.service import InlineMapping
 from thegra_core.messages import InitialMap, Keyframe, MapUpdate
-from thegra_core.process import keep_freed_memory
+from thegra_core.process import Usage, keep_freed_memory, own_usage
 
 logger = logging.getLogger(__name__)
 LAST_WORDS_S = 5.0
 """How long an ending process may take before it is killed."""
 _END = None
+_LAUNCH = f"import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); from {__name__} import main; main()"
+"""A terminal sends Ctrl-C to all processes, but it is meant for tracking, which tells when to end: it is ignored before anything else is imported."""
 MakeMatcher = Callable[[ThegraConfig], Matcher]
 """Builds the matcher in the process; must be a function of a module, which is pickled by its name."""
 
@@ -47,10 +49,9 @@ class MappingProcess:
     def __init__(self, camera: CameraModel, config: ThegraConfig, make_matcher: MakeMatcher) -> None:
         ours, theirs = socket.socketpair()
         with theirs:
-            command = [sys.executable, "-m", __name__, str(theirs.fileno())]
+            command = [sys.executable, "-c", _LAUNCH, str(theirs.fileno())]
             environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-            # a session of its own: Ctrl-C is meant for tracking, which tells when to end
-            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment, start_new_session=True)
+            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment)
         self._connection = Connection(ours.detach())
         self._outbox: queue.SimpleQueue[tuple[str, tuple[Any, ...]] | None] = queue.SimpleQueue()
         self._writer = threading.Thread(target=self._write, name="thegra mapping writer", daemon=True)
@@ -100,6 +101,11 @@ class MappingProcess:
         """See `MappingService.counts`."""
         loops, merges = self._ask("counts")
         return loops, merges
+
+    def usage(self) -> Usage:
+        """See `MappingService.usage`."""
+        usage: Usage = self._ask("usage")
+        return usage
 
     def close(self) -> None:
         """See `MappingService.close`."""
@@ -193,6 +199,8 @@ def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...]) -> tuple[
     if name in ("initialize", "insert", "drop"):
         getattr(mapping, name)(*arguments)
         return "updates", mapping.updates()
+    if name == "usage":
+        return "answer", own_usage()
     try:
         return "answer", getattr(mapping, name)(*arguments)
     except ThegraError as error:
@@ -204,7 +212,3 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING, format="[thegra mapping] %(levelname)s %(message)s")
     keep_freed_memory()
     serve(Connection(int(sys.argv[1])))
-
-
-if __name__ == "__main__":
-    main()

@@ -8,6 +8,7 @@ from typing import Protocol
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.messages import InitialMap, Keyframe, MapUpdate
+from thegra_core.process import Usage
 
 
 class MappingService(Protocol):
@@ -60,6 +61,10 @@ class MappingService(Protocol):
         """Loops closed and maps merged."""
         ...
 
+    def usage(self) -> Usage:
+        """What mapping has used beside the calling process."""
+        ...
+
     def close(self) -> None:
         """End; what was handed over may be left undone."""
         ...
@@ -109,6 +114,10 @@ class InlineMapping:
     def counts(self) -> tuple[int, int]:
         """See `MappingService.counts`."""
         return self._mapper.loops, self._mapper.merges
+
+    def usage(self) -> Usage:
+        """See `MappingService.usage`: nothing."""
+        return Usage()
 
     def close(self) -> None:
         """See `MappingService.close`."""
