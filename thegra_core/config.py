@@ -215,7 +215,7 @@ class FlowConfig(Section):
     window: int = Field(21, ge=5, le=61, description="px; side of the square that is followed (measured: 15 is 1.3 times faster and loses 2 to 4 % more points)")
     levels: int = Field(4, ge=0, le=8, description="halvings of the image; 4 follow 80 px (measured)")
     max_back_px: float = Field(1.0, gt=0, description="px by which a point followed there and back may miss where it came from")
-    patch: int = Field(9, ge=5, le=31, description="px; side of the square whose look is compared before and after")
+    patch: int = Field(15, ge=5, le=31, description="px; side of the square whose look is compared before and after")
     min_similarity: float = Field(0.7, ge=-1, le=1, description="least zero-mean normalized cross-correlation of the squares")
     border: int = Field(4, ge=0, le=64, description="px at the image's edge where nothing is followed")
     min_points: int = Field(80, ge=8, description="points below which new ones are detected")

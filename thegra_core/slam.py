@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
+from thegra_core.errors import MappingError
 from thegra_core.features.front_end import DetectAndFollow, DetectEach
 from thegra_core.features.protocols import Extractor, FrontEnd, Matcher, Wanted
 from thegra_core.features.registry import make_extractor, make_frame_matcher
@@ -44,6 +46,7 @@ from thegra_core.tracking.fixed_pattern import FixedPatternMask
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
 
 FloatArray = NDArray[np.float64]
+logger = logging.getLogger(__name__)
 _NO_POSE = (TrackingState.INITIALIZING, TrackingState.LOST, TrackingState.RELOCALIZING)
 BACKWARD_FRAMES = 3
 """Backward stamps in a row that are refused before time is believed to have been set back."""
@@ -203,10 +206,8 @@ class Slam:
         unproven = self._tracking.drop_unproven()
         if unproven is not None:
             self._drop(unproven)
-        if not self.localization_only:
-            say("full bundle adjustment")
-            for update in self._mapping.finish():
-                self._take(update)
+        say("full bundle adjustment")
+        maps, (loops, merges) = self._finished_maps()
         say("placing frames that had no pose")
         late = {p.stamp_ns: p for p in self._tracking.localize_afterwards()}
         for row, placed in enumerate(self._frames):
@@ -215,8 +216,6 @@ class Slam:
                 self._frames[row] = replace(
                     placed, map_id=found.map_id, reference_id=found.reference_id, reference_from_camera=found.reference_from_camera, afterwards=True
                 )
-        maps = {current.map_id: current for current in self._mapping.maps()}
-        loops, merges = self._mapping.counts()
         by_stamp = {(map_id, k.stamp_ns): k.id for map_id, m in maps.items() for k in m.keyframes.values() if k.id >= self._first_keyframe_id}
         records = tuple(self._final(placed, maps, by_stamp) for placed in self._frames)
         counts = Counter(r.map_id for r in records if r.world_from_camera is not None)
@@ -275,6 +274,17 @@ class Slam:
 
     def _unmasked(self, features: Features, reference: Features, matches: Matches) -> Matches:
         return self._fixed_pattern.learn(features, reference, matches) if self._masks else matches
+
+    def _finished_maps(self) -> tuple[dict[int, Map], tuple[int, int]]:
+        """Maps by id, and how many loops and merges there were; what tracking knows of its map where mapping has failed."""
+        try:
+            for update in self._mapping.finish() if not self.localization_only else ():
+                self._take(update)
+            return {current.map_id: current for current in self._mapping.maps()}, self._mapping.counts()
+        except MappingError as error:
+            logger.warning("the map is left as tracking knows it: %s", error)
+            known = self._tracking.map
+            return ({known.map_id: known} if known is not None and known.keyframes else {}), (0, 0)
 
     def _take_updates(self) -> None:
         for update in self._mapping.updates():
@@ -340,13 +350,12 @@ class Slam:
 
     @staticmethod
     def _final(placed: _Placed, maps: dict[int, Map], keyframe_by_stamp: dict[tuple[int, int], int]) -> FrameRecord:
-        """A frame carried by the final map; frames that became keyframes of a first map after their time have that keyframe's pose."""
-        itself = keyframe_by_stamp.get((placed.map_id, placed.result.stamp_ns)) if placed.reference_from_camera is not None else None
-        if itself is not None:
-            return FrameRecord(placed.index, placed.result, maps[placed.map_id].keyframes[itself].world_from_camera, placed.map_id, placed.afterwards)
-        if placed.reference_from_camera is not None:
-            pose = maps[placed.map_id].keyframes[placed.reference_id].world_from_camera @ placed.reference_from_camera
-            return FrameRecord(placed.index, placed.result, pose, placed.map_id, placed.afterwards)
+        """A frame carried by the final map; frames that are keyframes, also of a first map after their time, have that keyframe's pose."""
+        known = maps[placed.map_id].keyframes if placed.map_id in maps else {}
+        itself = keyframe_by_stamp.get((placed.map_id, placed.result.stamp_ns))
+        if placed.reference_from_camera is not None and (itself is not None or placed.reference_id in known):
+            beside = known[placed.reference_id].world_from_camera @ placed.reference_from_camera if itself is None else known[itself].world_from_camera
+            return FrameRecord(placed.index, placed.result, beside, placed.map_id, placed.afterwards)
         if placed.may_be_placed:
             for map_id, current in maps.items():
                 keyframe_id = keyframe_by_stamp.get((map_id, placed.result.stamp_ns))

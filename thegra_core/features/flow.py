@@ -61,7 +61,7 @@ def follow(before: Image, after: Image, points: Points, start: Points, config: F
     if len(points) == 0:
         return Followed(np.empty((0, 2), np.float32), np.empty(0, bool), np.empty(0, np.float32))
     window, use_start = (config.window, config.window), cv2.OPTFLOW_USE_INITIAL_FLOW
-    moved, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, start.copy(), winSize=window, maxLevel=config.levels, criteria=_STEPS, flags=use_start)
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, np.array(start, np.float32, order="C"), winSize=window, maxLevel=config.levels, criteria=_STEPS, flags=use_start)
     there: Points = np.asarray(moved, np.float32)
     back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, points.copy(), winSize=window, maxLevel=1, criteria=_STEPS, flags=use_start)
     found = (status.ravel() > 0) & (status_back.ravel() > 0)
@@ -85,6 +85,8 @@ def patch_similarity(before: Image, after: Image, points: Points, there: Points,
 def _patches(image: Image, points: Points, size: int) -> NDArray[np.float32]:
     """(N, size * size) values around points, between pixels by bilinear interpolation, beyond the border those of the border."""
     offsets = np.arange(size, dtype=np.float32) - (size - 1) / 2
-    x = (points[:, 0, None, None] + offsets[None, None, :]).repeat(size, axis=1).reshape(len(points), -1)
-    y = (points[:, 1, None, None] + offsets[None, :, None]).repeat(size, axis=2).reshape(len(points), -1)
+    x = (points[:, 0, None, None] + offsets[None, None, :]).repeat(size, axis=1).reshape(len(points), size * size)
+    y = (points[:, 1, None, None] + offsets[None, :, None]).repeat(size, axis=2).reshape(len(points), size * size)
+    if len(points) == 0:
+        return np.empty((0, size * size), np.float32)
     return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
