@@ -1,4 +1,4 @@
-"""How this process uses the machine: threads and memory. Called once, where a process starts; nothing here changes a result. And what it has used."""
+"""How this process uses the machine: threads and memory. Called once, where a process starts; nothing here changes a result. What it has used, and how it gets work done elsewhere."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ import os
 import resource
 import sys
 import time
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
+from typing import Any
 
 MOST_THREADS = 4
 """Of the networks by default; a keyframe's 1024 points do not fill more."""
@@ -44,6 +47,17 @@ def keep_freed_memory() -> None:
         return
     mallopt(_M_MMAP_THRESHOLD, _LARGEST_BYTES)
     mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+
+
+Submit = Callable[..., "Future[Any]"]
+"""Has a function of a module called with the arguments given, now or elsewhere."""
+
+
+def call_now(function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    """Call it here; the future is done. What it raises is raised."""
+    future: Future[Any] = Future()
+    future.set_result(function(*arguments))
+    return future
 
 
 @dataclass(frozen=True, slots=True)

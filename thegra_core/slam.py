@@ -101,10 +101,10 @@ class Slam:
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
-        self._tracking = TrackingStage(camera, config, self._matcher)
         self._mapping: MappingService = (
             MappingProcess(camera, config, make_frame_matcher) if beside else InlineMapping(Mapper(camera, config, self._matcher))
         )
+        self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit)
         self._frames: list[_Placed] = []
         self._last_stamp_ns: int | None = None
         self._backward, self._backward_ns = 0, None  # type: int, int | None

@@ -168,7 +168,7 @@ def evaluate(
     folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Where the data set lies; `generic`: YAML lists of recordings.")],
     dataset: Annotated[str, typer.Option(help="vivid, rovtio, tum, euroc, kitti or generic.")],
     runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
-    profile: Annotated[list[str] | None, typer.Option(help="paper, quality or fast; repeatable. Default: quality.")] = None,
+    profile: Annotated[list[str] | None, typer.Option(help="paper, quality, fast or realtime; repeatable. Default: quality.")] = None,
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time on this machine.")] = 1,
     dask: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler, which must see the same files.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for tables and runs; with the folder of an evaluation, only what is missing is run. Default: runs/evaluate_DATASET.")] = None,
@@ -206,7 +206,7 @@ def ablation(
     inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Recordings as `thegra run` takes them, with groundtruth.txt beside; with --dataset its folders.")],
     dataset: Annotated[str | None, typer.Option(help="Take the sequences of this data set, as `thegra evaluate` does.")] = None,
     choice: Annotated[list[Choice] | None, typer.Option(help="weighting or chain; repeatable. Default: both.")] = None,
-    profile: Annotated[str, typer.Option(help="paper, quality or fast: what the choices are made in.")] = "quality",
+    profile: Annotated[str, typer.Option(help="paper, quality, fast or realtime: what the choices are made in.")] = "quality",
     runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time on this machine.")] = 1,
     dask: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler, which must see the same files.")] = None,
@@ -234,7 +234,7 @@ def ablation(
 
 @app.command()
 def config(
-    profile: Annotated[str | None, typer.Option(help="paper, quality or fast. Default: quality.")] = None,
+    profile: Annotated[str | None, typer.Option(help="paper, quality, fast or realtime. Default: quality.")] = None,
     as_yaml: Annotated[bool, typer.Option("--yaml", help="Print YAML that --config reads.")] = False,
 ) -> None:
     """List every parameter with value, range, unit and source.

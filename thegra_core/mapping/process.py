@@ -14,7 +14,9 @@ import subprocess
 import sys
 import threading
 import traceback
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -57,6 +59,7 @@ class MappingProcess:
         self._writer = threading.Thread(target=self._write, name="thegra mapping writer", daemon=True)
         self._writer.start()
         self._updates: list[MapUpdate] = []
+        self._submitted: deque[Future[Any]] = deque()
         self._tell("begin", camera, config, make_matcher)
 
     def initialize(self, initial: InitialMap) -> None:
@@ -77,6 +80,12 @@ class MappingProcess:
             self._take(self._receive())
         taken, self._updates = self._updates, []
         return taken
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """See `MappingService.submit`."""
+        self._submitted.append(Future())
+        self._tell("call", function, *arguments)
+        return self._submitted[-1]
 
     def load(self, path: Path) -> MapUpdate:
         """See `MappingService.load`."""
@@ -142,6 +151,9 @@ class MappingProcess:
             if isinstance(content, ThegraError):
                 raise content
             raise MappingError(f"the process of the mapping stage has failed:\n{content}")
+        if kind == "result":
+            self._submitted.popleft().set_result(content)
+            return
         self._updates.extend(content)
 
     def _readable(self) -> bool:
@@ -199,6 +211,9 @@ def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...]) -> tuple[
     if name in ("initialize", "insert", "drop"):
         getattr(mapping, name)(*arguments)
         return "updates", mapping.updates()
+    if name == "call":
+        function, *rest = arguments
+        return "result", function(*rest)
     if name == "usage":
         return "answer", own_usage()
     try:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.messages import InitialMap, Keyframe, MapUpdate
-from thegra_core.process import Usage
+from thegra_core.process import Usage, call_now
 
 
 class MappingService(Protocol):
@@ -35,6 +37,10 @@ class MappingService(Protocol):
         Raises:
             MappingError: If mapping has ended with an error.
         """
+        ...
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Have a function of a module called where mapping runs, after what was handed over before; done when an `updates` after it finds it so."""
         ...
 
     def load(self, path: Path) -> MapUpdate:
@@ -94,6 +100,10 @@ class InlineMapping:
         """See `MappingService.updates`."""
         taken, self._updates = self._updates, []
         return taken
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """See `MappingService.submit`."""
+        return call_now(function, *arguments)
 
     def load(self, path: Path) -> MapUpdate:
         """See `MappingService.load`."""

@@ -28,6 +28,7 @@ from thegra_core.messages import (
     VisibilityCounts,
 )
 from thegra_core.places.index import PlaceIndex
+from thegra_core.process import Submit, call_now
 from thegra_core.tracking.followed import TrackLandmarks, localize_followed
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
@@ -127,14 +128,15 @@ class _Place:
 class TrackingStage:
     """State of tracking: the place in the current map, the map before it while a new one is on probation, and the search for a first map.
 
-    Call `process` (or `hold`) once a frame, hand what it returns to mapping, and `apply` every update that mapping sends back.
+    Call `process` (or `hold`) once a frame, hand what it returns to mapping, and `apply` every update that mapping sends back. What takes long at the start
+    of a map is done by `submit`.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher) -> None:
+    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher, submit: Submit = call_now) -> None:
         self._camera = camera
         self._config = config
         self._matcher = matcher
-        self._initializer = Initializer(camera, config, matcher)
+        self._initializer = Initializer(camera, config, matcher, submit)
         self._place: _Place | None = None
         self._before: _Place | None = None
         self._next_keyframe_id = 0
@@ -311,6 +313,8 @@ class TrackingStage:
         self._before, self._place = self._place, place
         self._next_map_id += 1
         self._next_keyframe_id += len(initial.keyframes)
+        if last.stamp_ns != features.stamp_ns:  # it was solved meanwhile: the frames to come are tracked in it
+            return replace(self._wait_for_map(place, features), initial_map=initial)
         keypoints = np.flatnonzero(last.landmark_ids != NO_LANDMARK)
         estimate = FrameView(features, self._camera, self._config).refine(
             poses.inverse(last.world_from_camera), initial.points_world[last.landmark_ids[keypoints]], keypoints, self._config.tracking.chi2_px2
