@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from thegra_core.errors import ConfigError
 
-PROFILES = ("paper", "quality", "fast")
+PROFILES = ("paper", "quality", "fast", "realtime")
 RUN_FACTS = "run"
 """Key of a run's `config.yaml` that tells what it was run on; no parameter."""
 
@@ -208,6 +208,22 @@ class MatcherConfig(Section):
     device: str = Field("auto", description="auto, cpu, cuda, cuda:0, ...")
 
 
+class FlowConfig(Section):
+    """Following keypoints from frame to frame instead of detecting in each."""
+
+    enabled: bool = Field(False, description="detect on keyframes and where following fails, follow by Lucas-Kanade in between; off: detect in every frame, as in the paper")
+    window: int = Field(21, ge=5, le=61, description="px; side of the square that is followed (measured: 15 is 1.3 times faster and loses 2 to 4 % more points)")
+    levels: int = Field(4, ge=0, le=8, description="halvings of the image; 4 follow 80 px (measured)")
+    max_back_px: float = Field(1.0, gt=0, description="px by which a point followed there and back may miss where it came from")
+    patch: int = Field(15, ge=5, le=31, description="px; side of the square whose look is compared before and after")
+    min_similarity: float = Field(0.7, ge=-1, le=1, description="least zero-mean normalized cross-correlation of the squares")
+    border: int = Field(4, ge=0, le=64, description="px at the image's edge where nothing is followed")
+    min_points: int = Field(80, ge=8, description="points below which new ones are detected")
+    min_share: float = Field(0.4, ge=0, le=1, description="the same, as a share of the points after the last detection")
+    near_px: float = Field(4.0, gt=0, description="px around a followed point in which a detection is the same point")
+    min_shared: int = Field(50, ge=8, description="tracks that two frames must share for these to be their matches; learned matching where they share fewer")
+
+
 # ---- the method (paper Sec. III-C, III-D) -----------------------------------------------------------------------------------------
 
 
@@ -253,6 +269,7 @@ class KeyframeConfig(Section):
     rotation_deg: float = Field(15.0, gt=0, description="degrees since the last keyframe; paper: 15")
     translation_ratio: float = Field(0.03, gt=0, description="displacement over median depth; paper: 0.03")
     min_tracked_ratio: float = Field(0.5, ge=0, le=1, description="landmarks tracked over those of the reference keyframe; below it a keyframe is due; 0: off, as in the paper")
+    most_pending: int = Field(2, ge=1, description="keyframes that wait for mapping, where it runs in a process of its own; none is made while so many do")
 
 
 class MappingConfig(Section):
@@ -327,6 +344,7 @@ class ThegraConfig(Section):
     preprocessing: PreprocessingConfig = PreprocessingConfig()
     extractor: ExtractorConfig = ExtractorConfig()
     matcher: MatcherConfig = MatcherConfig()
+    flow: FlowConfig = FlowConfig()
     initialization: InitializationConfig = InitializationConfig()
     tracking: TrackingConfig = TrackingConfig()
     keyframe: KeyframeConfig = KeyframeConfig()

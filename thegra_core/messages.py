@@ -76,7 +76,8 @@ class Features:
     """Keypoints of one frame.
 
     keypoints (N, 2) float32 pixels of the raw (distorted) image; scores (N,) float32 in (0, 1];
-    descriptors (N, D) float32 of unit norm, or (N, D) uint8 binary; image_size (width, height).
+    descriptors (N, D) float32 of unit norm, or (N, D) uint8 binary; image_size (width, height). track_ids (N,) int64, where keypoints are followed
+    from image to image: those of the same number are the same point; None where they are not.
     """
 
     stamp_ns: int
@@ -85,6 +86,7 @@ class Features:
     descriptors: NDArray[np.float32] | NDArray[np.uint8]
     image_size: tuple[int, int]
     extractor: str
+    track_ids: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.keypoints)

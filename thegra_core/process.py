@@ -1,10 +1,16 @@
-"""How this process uses the machine: threads and memory. Called once, where a process starts; nothing here changes a result."""
+"""How this process uses the machine: threads and memory. Called once, where a process starts; nothing here changes a result. What it has used, and how it gets work done elsewhere."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
 
 MOST_THREADS = 4
 """Of the networks by default; a keyframe's 1024 points do not fill more."""
@@ -41,3 +47,28 @@ def keep_freed_memory() -> None:
         return
     mallopt(_M_MMAP_THRESHOLD, _LARGEST_BYTES)
     mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+
+
+Submit = Callable[..., "Future[Any]"]
+"""Has a function of a module called with the arguments given, now or elsewhere."""
+
+
+def call_now(function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    """Call it here; the future is done. What it raises is raised."""
+    future: Future[Any] = Future()
+    future.set_result(function(*arguments))
+    return future
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What a process has used so far: seconds of all cores, and the most memory at a time in MiB."""
+
+    cpu_s: float = 0.0
+    peak_rss_mb: float = 0.0
+
+
+def own_usage() -> Usage:
+    """Usage of this process, without its children."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return Usage(time.process_time(), peak / (1 << 20) if sys.platform == "darwin" else peak / 1024)

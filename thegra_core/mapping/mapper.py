@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from thegra_core.config import ThegraConfig
+from thegra_core.errors import InputError
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.editor import MapEditor
-from thegra_core.map.map import Map
+from thegra_core.map.map import Map, summarize
 from thegra_core.mapping import culling
 from thegra_core.mapping.adjustment import adjust_all, adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
@@ -110,6 +111,16 @@ class Mapper:
         kept = KeptMap(self._editors[map_id], self._graphs[map_id], self._loops[map_id].index, self._trial[map_id])
         save_map(path, kept, self._config)
 
+    def save_largest(self, path: Path) -> None:
+        """Write the map with most keyframes, the older of equals.
+
+        Raises:
+            InputError: If there is none, or the file cannot be written.
+        """
+        if not self._editors:
+            raise InputError(f"there is no map yet that could be written to {path}")
+        self.save(max(self._editors, key=lambda i: (len(self._editors[i].map.keyframes), -i)), path)
+
     def load(self, path: Path) -> MapUpdate:
         """Take a map from a file, beside those that are there; returns the whole of it as an update.
 
@@ -148,17 +159,8 @@ class Mapper:
         return self._editors[map_id].map
 
     def summary(self, map_id: int) -> MapSummary:
-        """A copy of what a finished map holds, for outputs."""
-        current = self._editors[map_id].map
-        keyframes = [current.keyframes[i] for i in sorted(current.keyframes)]
-        landmarks = current.landmarks.get(current.landmarks.alive_ids()) if len(current.landmarks) else None
-        return MapSummary(
-            map_id=map_id,
-            keyframe_stamps_ns=np.array([k.stamp_ns for k in keyframes], dtype=np.int64),
-            keyframe_poses=np.array([k.world_from_camera for k in keyframes]).reshape(-1, 4, 4),
-            points_world=landmarks.points_world if landmarks is not None else np.empty((0, 3)),
-            point_scores=landmarks.scores if landmarks is not None else np.empty(0, np.float32),
-        )
+        """A copy of what a map holds, for outputs."""
+        return summarize(self._editors[map_id].map)
 
     def _merge(self, editor: MapEditor, keyframe: Keyframe) -> MapUpdate | None:
         """The whole of an older map that a map has become part of, if this keyframe ties them."""
@@ -174,8 +176,8 @@ class Mapper:
         for sighting in tie.sightings:
             for other, matches in sighting.matches.items():
                 graph.add(sighting.keyframe_id, other, matches)
-        for i, keyframe in sorted(editor.map.keyframes.items()):
-            self._loops[tie.old_map_id].index.add(i, keyframe.features)
+        for i, joined in sorted(editor.map.keyframes.items()):
+            self._loops[tie.old_map_id].index.add(i, joined.features)
         self._loops[tie.old_map_id].closed += self._loops[map_id].closed
         self._trial[tie.old_map_id].extend(renamed[i] for i in self._trial[map_id] if i in renamed)
         self.drop(map_id)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -16,6 +14,7 @@ from thegra_core.config import ThegraConfig
 from thegra_core.messages import FrameRecord, Revisit, Run, TrackingState
 from thegra_core.outputs.scoring import Score, path_length, score_trajectory, within
 from thegra_core.outputs.trajectory import NS_PER_S, Trajectory, final_trajectory, live_trajectory
+from thegra_core.process import own_usage
 from thegra_core.version import VERSION
 
 TOTAL = "total"
@@ -29,7 +28,8 @@ class Timing:
     """What the run cost.
 
     wall_s covers all frames, without the work after the last one (`finish_s`); frames_read counts the frames that were handed to the system.
-    cached_pct is the share of the networks' results that came from a cache, None without one.
+    cached_pct is the share of the networks' results that came from a cache, None without one. latency_ms, of a recording that was played at its own rate:
+    from a frame's delivery to its pose. cpu_s: of all processes and cores, for the frames of `wall_s`. apart_rss_mb: the most memory of a process beside this.
     """
 
     wall_s: float
@@ -37,6 +37,9 @@ class Timing:
     finish_s: float = 0.0
     dropped_frames: int = 0
     cached_pct: float | None = None
+    latency_ms: Sequence[float] = ()
+    cpu_s: float = 0.0
+    apart_rss_mb: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +71,7 @@ def run_metrics(
     tracked = [f for f in run.frames if f.world_from_camera is not None]
     in_main = sum(f.map_id == run.main_map_id for f in tracked)
     bad = dict(Counter(run.bad_frames) + Counter(unreadable or {}))
-    total = max(timing.frames_read, len(run.frames)) + sum((unreadable or {}).values())
+    total = max(timing.frames_read, len(run.frames)) + timing.dropped_frames + sum((unreadable or {}).values())
     metrics: dict[str, Any] = {
         "frames_total": total,
         "frames_tracked": in_main,
@@ -115,12 +118,6 @@ def _losses(run: Run) -> list[dict[str, Any]]:
     return found
 
 
-def peak_rss_mb() -> float:
-    """Largest resident memory of this process so far, MiB."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20) if sys.platform == "darwin" else peak / 1024
-
-
 def percentiles(values: Sequence[float] | np.ndarray[Any, Any], which: Iterable[int]) -> dict[str, float | None]:
     """{"p50": ..., ...}; None each when there are no values."""
     return {f"p{p}": round(float(np.percentile(values, p)), 3) if len(values) else None for p in which}
@@ -156,12 +153,14 @@ def _time_metrics(run: Run, timing: Timing) -> dict[str, Any]:
     return {
         "fps": round(timing.frames_read / timing.wall_s, 3) if timing.wall_s > 0 else None,
         "ms_per_frame": percentiles(frame_ms, (50, 95, 99)),
-        "ms": {stage: percentiles(values, (50, 95)) for stage, values in stages.items()},
+        "ms": {stage: percentiles(values, (50, 95, 99)) for stage, values in stages.items()},
         "wall_s": round(timing.wall_s, 3),
         "finish_s": round(timing.finish_s, 3),
         "dropped_frames": timing.dropped_frames,
+        "latency_ms": percentiles(timing.latency_ms, (50, 95, 99)),
+        "cpu_s_per_frame": round(timing.cpu_s / timing.frames_read, 4) if timing.frames_read else None,
         "cached_pct": timing.cached_pct,
-        "peak_rss_mb": round(peak_rss_mb(), 1),
+        "peak_rss_mb": round(own_usage().peak_rss_mb + timing.apart_rss_mb, 1),
     }
 
 
