@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -33,10 +32,9 @@ from thegra_core.messages import (
     Snapshot,
     TrackingResult,
     TrackingState,
-    TurnedView,
 )
 from thegra_core.optimization.solver import BundleSolver
-from thegra_core.places.turning import turned_view
+from thegra_core.places.turning import TurningMatcher, turned_features
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
 from thegra_core.snapshots import SnapshotKeeper
@@ -92,9 +90,10 @@ class Slam:
         self._shutter = ShutterDetector(config.preprocessing.shutter)
         self._fixed_pattern = FixedPatternMask()
         self._masks = config.tracking.mask_fixed_pattern
-        self._rotations = config.loop.rotations
         self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
-        self._matcher = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
+        self._matcher = TurningMatcher(matcher if matcher is not None else make_matcher(config.matcher, config.extractor))
+        self._rotations = config.loop.rotations
+        self._turns = 0
         self._tracking = TrackingStage(camera, config, self._matcher)
         self._mapper = Mapper(camera, config, self._matcher, solver)
         self._frames: list[_Placed] = []
@@ -221,31 +220,37 @@ class Slam:
         with self._timed("preprocessing"):
             image = self._chain(frame.image, frame.stamp_ns)
         with self._timed("extraction"):
-            features = self._extractor.extract(image, frame.stamp_ns)
-            features = self._fixed_pattern.apply(features)
+            features = self._features(image, frame.stamp_ns, self._turns)
         reference = self._tracking.reference_features
         with self._timed("matching"):
             matches = self._matcher.match(features, reference) if reference is not None else None
             if reference is not None and matches is not None and self._masks:
                 matches = self._fixed_pattern.learn(features, reference, matches)
-        turned = functools.cache(lambda: self._turned(image, features))
         with self._timed("tracking"):
-            output = self._tracking.process(features, matches, turned)
+            output = self._tracking.process(features, matches, self._otherwise(image, frame.stamp_ns))
+        if output.found_turned is not None:
+            features = output.found_turned
+            self._turns = features.turns
         if output.dropped_map_id is not None:
             self._drop(output.dropped_map_id)
         with self._timed("mapping"):
             if output.initial_map is not None:
                 self._tracking.apply(self._mapper.initialize(output.initial_map))
             elif output.keyframe is not None:
-                update = self._mapper.insert(replace(output.keyframe, turned=turned()))
+                update = self._mapper.insert(output.keyframe)
                 self._tracking.apply(update)
                 self._follow(update)
         self._view = lambda: _snapshot(frame, image, features, output, reference)
         self._snapshots.offer(frame.index, self._view)
         return output
 
-    def _turned(self, image: NDArray[np.uint8], features: Features) -> tuple[TurnedView, ...]:
-        return tuple(turned_view(image, features, degrees // 90, self._extractor) for degrees in self._rotations)
+    def _features(self, image: NDArray[np.uint8], stamp_ns: int, turns: int) -> Features:
+        return self._fixed_pattern.apply(turned_features(image, stamp_ns, turns, self._extractor))
+
+    def _otherwise(self, image: NDArray[np.uint8], stamp_ns: int) -> Iterator[Features]:
+        """The features of the other orientations, each found when it is asked for."""
+        for degrees in self._rotations:
+            yield self._features(image, stamp_ns, (self._turns + degrees // 90) % 4)
 
     def _trouble(self, frame: Frame) -> str:
         """What is wrong with a frame, or an empty string."""

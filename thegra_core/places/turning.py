@@ -1,51 +1,42 @@
-"""Images turned by quarter turns: learned descriptors know up from down, and a camera that looks at the ground comes back turned round."""
+"""Images turned by quarter turns before anything is looked for in them: learned features know up from down, and a camera that looks at the ground turns round.
+
+A turned image does not show the same keypoints as the upright one: a corner of a tree's crown is another corner then. So a frame's features are those of one
+orientation, chosen so that they look like the map; what is told of them, their pixels above all, is upright all the same.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from thegra_core.features.protocols import Extractor, Matcher
-from thegra_core.messages import Features, Matches, TurnedView
-
-SAME_KEYPOINT_PX = 2.0
-"""A keypoint of the turned image is the upright one that it falls on to within this."""
+from thegra_core.messages import Features, Float32Array, Matches
 
 
-def turned_view(image: NDArray[np.uint8], upright: Features, quarter_turns: int, extractor: Extractor) -> TurnedView:
-    """What the extractor finds in an image (H, W) turned counter-clockwise by quarter turns, and which of the upright keypoints that is."""
-    turned = extractor.extract(np.ascontiguousarray(np.rot90(image, quarter_turns)), upright.stamp_ns)
-    if len(upright) == 0 or len(turned) == 0:
-        return TurnedView(turned, np.full(len(turned), -1, dtype=np.int64))
-    pixels = turn_back(turned.keypoints.astype(np.float64), quarter_turns, upright.image_size)
-    there = cKDTree(upright.keypoints)
-    distance, nearest = there.query(pixels, distance_upper_bound=SAME_KEYPOINT_PX)
-    found = np.where(np.isfinite(distance), nearest, -1).astype(np.int64)
-    order = np.argsort(distance, kind="stable")  # of several that fall on one keypoint the nearest
-    first = order[np.sort(np.unique(found[order], return_index=True)[1])]
-    upright_of = np.full(len(turned), -1, dtype=np.int64)
-    upright_of[first] = found[first]
-    return TurnedView(turned, upright_of)
+def turned_features(image: NDArray[np.uint8], stamp_ns: int, turns: int, extractor: Extractor) -> Features:
+    """What the extractor finds in an image (H, W) turned counter-clockwise by quarter turns, at upright pixels."""
+    if turns % 4 == 0:
+        return extractor.extract(image, stamp_ns)
+    found = extractor.extract(np.ascontiguousarray(np.rot90(image, turns)), stamp_ns)
+    return replace(found, keypoints=turned_pixels(found.keypoints, -turns, found.image_size), image_size=_size(found.image_size, turns), turns=turns % 4)
 
 
-def turn_back(pixels: NDArray[np.float64], quarter_turns: int, image_size: tuple[int, int]) -> NDArray[np.float64]:
-    """Pixels (N, 2) of the turned image in the upright one of `image_size` (width, height)."""
+def turned_pixels(pixels: Float32Array, turns: int, image_size: tuple[int, int]) -> Float32Array:
+    """Where pixels (N, 2) of an image of `image_size` (width, height) are when it is turned counter-clockwise by quarter turns."""
     width, height = image_size
     x, y = pixels[:, 0], pixels[:, 1]
-    back = {0: (x, y), 1: (width - 1 - y, x), 2: (width - 1 - x, height - 1 - y), 3: (y, height - 1 - x)}[quarter_turns % 4]
-    return np.stack(back, axis=1)
+    turned = ((x, y), (y, width - 1 - x), (width - 1 - x, height - 1 - y), (height - 1 - y, x))[turns % 4]
+    return np.ascontiguousarray(np.stack(turned, axis=1))
 
 
 @dataclass(frozen=True, slots=True)
-class TurnedMatcher:
-    """`Matcher` of one image that looks at it turned: whatever it is asked about, it matches that view, and answers in upright keypoints."""
+class TurningMatcher:
+    """`Matcher` that shows another one the features of each image as they were found, in the turned image."""
 
     inner: Matcher
-    view: TurnedView
 
     @property
     def name(self) -> str:
@@ -53,15 +44,20 @@ class TurnedMatcher:
 
     def match(self, query: Features, reference: Features) -> Matches:
         """See `Matcher.match`."""
-        return self._upright(self.inner.match(self.view.features, reference))
+        return self.inner.match(_as_found(query), _as_found(reference))
 
     def match_many(self, query: Features, references: Sequence[Features]) -> list[Matches]:
         """See `Matcher.match_many`."""
-        return [self._upright(matches) for matches in self.inner.match_many(self.view.features, references)]
+        return self.inner.match_many(_as_found(query), [_as_found(reference) for reference in references])
 
-    def _upright(self, matches: Matches) -> Matches:
-        query = self.view.upright[matches.indices[:, 0]]
-        rows = np.flatnonzero(query >= 0)
-        rows = rows[np.argsort(query[rows], kind="stable")]
-        indices = np.stack((query[rows], matches.indices[rows, 1]), axis=1).astype(np.int32)
-        return Matches(matches.stamp_ns, matches.reference_stamp_ns, indices, matches.confidence[rows])
+
+def _as_found(features: Features) -> Features:
+    if features.turns == 0:
+        return features
+    pixels = turned_pixels(features.keypoints, features.turns, features.image_size)
+    return replace(features, keypoints=pixels, image_size=_size(features.image_size, features.turns), turns=0)
+
+
+def _size(image_size: tuple[int, int], turns: int) -> tuple[int, int]:
+    width, height = image_size
+    return (height, width) if turns % 2 else (width, height)
