@@ -77,7 +77,8 @@ class Features:
 
     keypoints (N, 2) float32 pixels of the raw (distorted) image; scores (N,) float32 in (0, 1];
     descriptors (N, D) float32 of unit norm, or (N, D) uint8 binary; image_size (width, height). track_ids (N,) int64, where keypoints are followed
-    from image to image: those of the same number are the same point; None where they are not.
+    from image to image: those of the same number are the same point; None where they are not. `turns` are the quarter turns counter-clockwise by which the
+    image was turned when they were found and described; keypoints and size are those of the upright image all the same.
     """
 
     stamp_ns: int
@@ -87,6 +88,7 @@ class Features:
     image_size: tuple[int, int]
     extractor: str
     track_ids: IntArray | None = None
+    turns: int = 0
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -109,20 +111,11 @@ class Matches:
 
 
 @dataclass(frozen=True, slots=True)
-class TurnedView:
-    """A frame's image seen turned by a quarter, half or three quarters: its features there, and the upright keypoint (N,) each of them is, -1 for none."""
-
-    features: Features
-    upright: IntArray
-
-
-@dataclass(frozen=True, slots=True)
 class Keyframe:
     """A frame that joins the map, as tracking hands it to mapping.
 
     landmark_ids (N,) int64, one per keypoint, `NO_LANDMARK` where there is none. `reference_matches` are the learned
-    matches to keyframe `reference_id` that tracking already has. The visibility counts are those of the frames since the last keyframe. `turned` is there
-    where places are to be found again by a camera that has turned.
+    matches to keyframe `reference_id` that tracking already has. The visibility counts are those of the frames since the last keyframe.
     """
 
     id: int
@@ -134,7 +127,6 @@ class Keyframe:
     map_id: int
     reference_matches: Matches | None = None
     seen: VisibilityCounts | None = None
-    turned: tuple[TurnedView, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import time
 from collections import Counter
@@ -20,6 +19,7 @@ from thegra_core.features.front_end import DetectAndFollow, DetectEach
 from thegra_core.features.protocols import Extractor, FrontEnd, Matcher, Wanted
 from thegra_core.features.registry import make_extractor, make_frame_matcher
 from thegra_core.features.tracks import shared_tracks
+from thegra_core.features.turning import TurnableExtractor
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map, summarize
 from thegra_core.mapping.mapper import Mapper
@@ -39,10 +39,8 @@ from thegra_core.messages import (
     Snapshot,
     TrackingResult,
     TrackingState,
-    TurnedView,
 )
 from thegra_core.optimization.solver import BundleSolver
-from thegra_core.places.turning import turned_view
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
 from thegra_core.process import Usage
@@ -112,7 +110,7 @@ class Slam:
         self._fixed_pattern = FixedPatternMask()
         self._masks = config.tracking.mask_fixed_pattern
         self._rotations = config.loop.rotations
-        self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
+        self._extractor = TurnableExtractor(extractor if extractor is not None else make_extractor(config.extractor))
         self._matcher = make_frame_matcher(config, matcher)
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
@@ -270,8 +268,10 @@ class Slam:
         self._snapshots.offer(frame.index, self._view)
         return output
 
-    def _turned(self, image: NDArray[np.uint8], features: Features) -> tuple[TurnedView, ...]:
-        return tuple(turned_view(image, features, degrees // 90, self._extractor) for degrees in self._rotations)
+    def _otherwise(self, image: NDArray[np.uint8], stamp_ns: int) -> Iterator[Features]:
+        """The features of the other orientations, each found when it is asked for."""
+        for degrees in self._rotations:
+            yield self._fixed_pattern.apply(self._extractor.turned(image, stamp_ns, degrees // 90))
 
     def _front(self, image: NDArray[np.uint8], stamp_ns: int, reference: Features | None) -> tuple[Features, TrackingOutput]:
         """Features of the image and what tracking made of them: of those followed, if there are any and they suffice, else of what is detected."""
@@ -291,11 +291,12 @@ class Slam:
             features = self._fixed_pattern.apply(self._front_end.detect(wanted))
         with self._timed("matching"):
             matches = self._unmasked(features, reference, self._matcher.match(features, reference)) if reference is not None else None
-        turned = functools.cache(lambda: self._turned(image, features))
         with self._timed("tracking"):
-            output = self._tracking.process(features, matches, turned)
-        if output.keyframe is not None:
-            output = replace(output, keyframe=replace(output.keyframe, turned=turned()))
+            output = self._tracking.process(features, matches, self._otherwise(image, stamp_ns))
+        if output.found_turned is not None:
+            features = output.found_turned
+            self._extractor.turns = features.turns
+            self._front_end.forget()
         return features, output
 
     def _unmasked(self, features: Features, reference: Features, matches: Matches) -> Matches:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
@@ -320,3 +322,23 @@ def test_noise_of_the_front_end_is_repeatable() -> None:
     a, b = (observe(walk_world(), WALK[3], stamp(3)) for _ in range(2))
     assert a.keypoints.tobytes() == b.keypoints.tobytes()
     assert Shutter.OPEN is not Shutter.CLOSED
+
+
+def test_a_system_that_is_given_up_gives_its_memory_back() -> None:
+    """What a reset does: the old system goes, another begins. Nothing may hold on to the old map."""
+    stream = frames(30)
+    play(make(walk_world(), WALK), stream[:12])  # what is loaded once for all
+    tracemalloc.start()
+    try:
+        gc.collect()
+        before = tracemalloc.get_traced_memory()[0]
+        slam = make(walk_world(), WALK)
+        for frame in stream:
+            slam.process(frame)
+        held = tracemalloc.get_traced_memory()[0] - before
+        del slam
+        gc.collect()
+        left = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert held > 1 << 20 and left < 0.05 * held

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -15,10 +14,9 @@ from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.editor import MapEditor
 from thegra_core.mapping.adjustment import adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
-from thegra_core.messages import NO_LANDMARK, Revisit, TurnedView
+from thegra_core.messages import NO_LANDMARK, Revisit
 from thegra_core.optimization.pose_graph import Edge, optimize_pose_graph
 from thegra_core.places.index import PlaceIndex
-from thegra_core.places.turning import TurnedMatcher
 from thegra_core.places.verification import Sighting, agree, sight
 
 logger = logging.getLogger(__name__)
@@ -42,9 +40,9 @@ class LoopCloser:
     def __post_init__(self) -> None:
         self.index = PlaceIndex(self.config.loop, self.config.seed)
 
-    def look(self, editor: MapEditor, keyframe_id: int, graph: MatchGraph, turned: Sequence[TurnedView] = ()) -> bool:
-        """Whether a keyframe of the index, which mapping has finished with, closed a loop; `turned` are other views of it to look at."""
-        sighting = self._find(editor, keyframe_id, turned)
+    def look(self, editor: MapEditor, keyframe_id: int, graph: MatchGraph) -> bool:
+        """Whether a keyframe of the index, which mapping has finished with, closed a loop."""
+        sighting = self._find(editor, keyframe_id)
         before, self._waiting = self._waiting, sighting
         if before is None or sighting is None or not {before.keyframe_id, *before.matches} <= editor.map.keyframes.keys() or not agree(editor.map, before, sighting, self.config):
             return False
@@ -53,18 +51,16 @@ class LoopCloser:
         self.closed += 1
         return True
 
-    def _find(self, editor: MapEditor, keyframe_id: int, turned: Sequence[TurnedView]) -> Sighting | None:
+    def _find(self, editor: MapEditor, keyframe_id: int) -> Sighting | None:
         current = editor.map
         direct = current.neighbours(keyframe_id, len(current.keyframes))
         connected = list(dict.fromkeys([*direct, *(second for first in direct for second in current.neighbours(first, len(current.keyframes)))]))
-        for view in (None, *turned):
-            matcher = self.matcher if view is None else TurnedMatcher(self.matcher, view)
-            for candidate in self.index.candidates(keyframe_id, connected, None if view is None else view.features)[:1]:
-                near = [i for i in current.neighbours(candidate, len(current.keyframes)) if i not in connected]
-                found = sight(current, keyframe_id, current, [candidate, *near[: self.config.loop.group - 1]], matcher, self.config)
-                if isinstance(found, Sighting):
-                    return found
-                logger.debug("keyframe %d looks like %d: %s", keyframe_id, candidate, found)
+        for candidate in self.index.candidates(keyframe_id, connected)[:1]:
+            near = [i for i in current.neighbours(candidate, len(current.keyframes)) if i not in connected]
+            found = sight(current, keyframe_id, current, [candidate, *near[: self.config.loop.group - 1]], self.matcher, self.config)
+            if isinstance(found, Sighting):
+                return found
+            logger.debug("keyframe %d looks like %d: %s", keyframe_id, candidate, found)
         return None
 
 

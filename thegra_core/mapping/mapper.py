@@ -88,9 +88,9 @@ class Mapper:
         loops = self._loops[keyframe.map_id]
         loops.index.add(keyframe.id, keyframe.features)
         if self._config.loop.enabled:
-            if loops.look(editor, keyframe.id, self._graphs[keyframe.map_id], keyframe.turned):
+            if loops.look(editor, keyframe.id, self._graphs[keyframe.map_id]):
                 self._full.start(editor)
-            merged = self._merge(editor, keyframe)
+            merged = self._merge(editor, keyframe.id)
             if merged is not None:
                 return merged
         return editor.take_update()
@@ -162,11 +162,11 @@ class Mapper:
         """A copy of what a map holds, for outputs."""
         return summarize(self._editors[map_id].map)
 
-    def _merge(self, editor: MapEditor, keyframe: Keyframe) -> MapUpdate | None:
+    def _merge(self, editor: MapEditor, keyframe_id: int) -> MapUpdate | None:
         """The whole of an older map that a map has become part of, if this keyframe ties them."""
         map_id = editor.map.map_id
         others = {i: (self._editors[i].map, self._loops[i].index) for i in self._editors if i != map_id}
-        tie = self._merger.find(editor.map, keyframe.id, others, keyframe.turned)
+        tie = self._merger.find(editor.map, keyframe_id, others)
         if tie is None:
             return None
         old, similarity = self._editors[tie.old_map_id], tie.old_from_new(editor.map)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from thegra_core.config import ThegraConfig
@@ -12,9 +12,8 @@ from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.editor import MapEditor
 from thegra_core.map.map import Map
 from thegra_core.mapping.loop_closing import ESSENTIAL_NEIGHBOURS, adjust_both_sides, fuse_sighting
-from thegra_core.messages import Revisit, TurnedView
+from thegra_core.messages import Revisit
 from thegra_core.places.index import NEAR, PlaceIndex
-from thegra_core.places.turning import TurnedMatcher
 from thegra_core.places.verification import Sighting, agree, sight
 
 logger = logging.getLogger(__name__)
@@ -41,26 +40,21 @@ class MapMerger:
     matcher: Matcher
     _waiting: dict[int, Sighting] = field(default_factory=dict)
 
-    def find(self, new: Map, keyframe_id: int, others: Mapping[int, tuple[Map, PlaceIndex]], turned: Sequence[TurnedView] = ()) -> Tie | None:
-        """A tie of the keyframe's map to one of the others, if this keyframe and the one before it make one; `turned` are other views of it to look at."""
+    def find(self, new: Map, keyframe_id: int, others: Mapping[int, tuple[Map, PlaceIndex]]) -> Tie | None:
+        """A tie of the keyframe's map to one of the others, if this keyframe and the one before it make one."""
         keyframe = new.keyframes[keyframe_id]
         before = {map_id: found for map_id, found in self._waiting.items() if found.keyframe_id in new.keyframes}
         self._waiting = {}
         near = [new.keyframes[i].features for i in new.neighbours(keyframe_id, NEAR)] if others else []
         for map_id, (old, index) in sorted(others.items()):
-            for view in (None, *turned):
-                candidates = index.alike(keyframe.features, near, None if view is None else view.features)[:1]
-                matcher = self.matcher if view is None else TurnedMatcher(self.matcher, view)
-                if not candidates:
-                    continue
-                found = sight(new, keyframe_id, old, [candidates[0], *old.neighbours(candidates[0], self.config.loop.group - 1)], matcher, self.config)
+            for candidate in index.alike(keyframe.features, near)[:1]:
+                found = sight(new, keyframe_id, old, [candidate, *old.neighbours(candidate, self.config.loop.group - 1)], self.matcher, self.config)
                 if isinstance(found, str):
-                    logger.debug("keyframe %d looks like %d of map %d: %s", keyframe_id, candidates[0], map_id, found)
+                    logger.debug("keyframe %d looks like %d of map %d: %s", keyframe_id, candidate, map_id, found)
                     continue
                 if map_id in before and agree(new, before[map_id], found, self.config):
                     return Tie(map_id, (before[map_id], found))
                 self._waiting[map_id] = found
-                break
         return None
 
 

@@ -60,31 +60,24 @@ class PlaceIndex:
             return []
         return _ranked(self._similar(describe(features, self._vocabulary)))[:most]
 
-    def alike(self, features: Features, near: Sequence[Features], turned: Features | None = None) -> list[int]:
-        """Keyframes that look nearly as much like an image that is none of them as the first images of `near` it do, the most similar first.
-
-        turned: as for `candidates`.
-        """
+    def alike(self, features: Features, near: Sequence[Features]) -> list[int]:
+        """Keyframes that look nearly as much like an image that is none of them as the first images of `near` it do, the most similar first."""
         if self._vocabulary is None:
             return []
         vector = describe(features, self._vocabulary)
-        similar = self._similar(vector if turned is None else describe(turned, self._vocabulary))
-        return self._above_bar(similar, [float(vector @ describe(other, self._vocabulary)) for other in near[:NEAR]])
+        return self._above_bar(self._similar(vector), [float(vector @ describe(other, self._vocabulary)) for other in near[:NEAR]])
 
-    def candidates(self, keyframe_id: int, connected: Sequence[int], turned: Features | None = None) -> list[int]:
+    def candidates(self, keyframe_id: int, connected: Sequence[int]) -> list[int]:
         """Keyframes that look nearly as much like this one as those do that see the same, the most similar first.
 
-        connected: ids that are no news, those that share most with it first. turned: look for what looks like this view of it, by the same bar.
+        connected: ids that are no news, those that share most with it first.
         """
-        if keyframe_id not in self._rows or self._vocabulary is None:
+        if keyframe_id not in self._rows:
             return []
         similar = self._similar(self._vectors[self._rows[keyframe_id]])
         del similar[keyframe_id]
-        near = [similar.pop(i) for i in connected if i in similar][:NEAR]
-        if turned is not None:
-            as_turned = self._similar(describe(turned, self._vocabulary))
-            similar = {i: as_turned[i] for i in similar}
-        return self._above_bar(similar, near)
+        near = [similar.pop(i) for i in connected if i in similar]
+        return self._above_bar(similar, near[:NEAR])
 
     def arrays(self) -> Arrays:
         """Words and vectors for a map file; nothing before there are words."""

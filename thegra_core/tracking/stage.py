@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,11 +26,9 @@ from thegra_core.messages import (
     Matches,
     TrackingResult,
     TrackingState,
-    TurnedView,
     VisibilityCounts,
 )
 from thegra_core.places.index import PlaceIndex
-from thegra_core.places.turning import TurnedMatcher
 from thegra_core.process import Submit, call_now
 from thegra_core.tracking.followed import TrackLandmarks, localize_followed
 from thegra_core.tracking.initializer import Initializer
@@ -50,6 +48,8 @@ class TrackingOutput:
 
     While a new map is on probation nothing is claimed: `result` has no pose, and `provisional` is the result that holds if the map stands.
     `dropped_map_id` names a map that did not stand. landmark_ids (N,) per keypoint and the matches used are for viewers; None where there are none.
+    found_turned: the frame's features of another orientation, by which it was found; landmark_ids and matches are theirs, and the next frames had better be
+    turned alike.
     """
 
     result: TrackingResult
@@ -59,6 +59,7 @@ class TrackingOutput:
     matches: Matches | None = None
     provisional: TrackingResult | None = None
     dropped_map_id: int | None = None
+    found_turned: Features | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,8 +168,8 @@ class TrackingStage:
     def map_id(self) -> int:
         return self._place.map.map_id if self._place is not None else -1
 
-    def process(self, features: Features, matches: Matches | None, turned: Callable[[], Sequence[TurnedView]] = tuple) -> TrackingOutput:
-        """Track one frame; `matches` are to `reference_features` (None: not matched yet). `turned` gives other views of it, asked for where it is not found."""
+    def process(self, features: Features, matches: Matches | None, turned: Iterable[Features] = ()) -> TrackingOutput:
+        """Track one frame; `matches` are to `reference_features` (None: not matched yet). `turned` gives its features of other orientations, taken as needed."""
         place = self._place
         if place is None:
             return self._start(features, matches)
@@ -402,9 +403,7 @@ class TrackingStage:
         depth = place.map.median_depth(place.reference_id, found.world_from_camera)
         return bool(needs_keyframe(place.last_keyframe_pose, found.world_from_camera, depth, tracked_ratio, self._config.keyframe))
 
-    def _recover(
-        self, place: _Place, features: Features, matches: Matches, reason: str, turned: Callable[[], Sequence[TurnedView]]
-    ) -> TrackingOutput:
+    def _recover(self, place: _Place, features: Features, matches: Matches, reason: str, turned: Iterable[Features]) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
         if place.probation:
             dropped = self._drop()
@@ -412,11 +411,14 @@ class TrackingStage:
             output = self._start(features, None) if self._place is None else self._stay_lost(self._place, features, reason)
             return replace(output, dropped_map_id=dropped)
         found = self._seek(place, features, matches)
-        if found is None:
-            found = next(filter(None, (self._seek(place, features, None, view) for view in turned())), None)
         if found is not None:
             place.reference_id = found[1]
             return self._accept(place, features, found[0], found[2])
+        for other in turned:
+            found = self._seek(place, other, self._matcher.match(other, place.reference))
+            if found is not None:
+                place.reference_id = found[1]
+                return replace(self._accept(place, other, found[0], found[2]), found_turned=other)
         if place.search_frames:
             place.search_frames -= 1
             self._unplaced.append(features)
@@ -424,22 +426,15 @@ class TrackingStage:
             return TrackingOutput(result)
         return self._stay_lost(place, features, reason)
 
-    def _seek(
-        self, place: _Place, features: Features, matches: Matches | None, view: TurnedView | None = None
-    ) -> tuple[Localization, int, Matches] | None:
-        """Match a frame to the last keyframes or, once it is lost, to those that look most alike; as it is, with the matches to the reference there are, or as turned."""
+    def _seek(self, place: _Place, features: Features, matches: Matches) -> tuple[Localization, int, Matches] | None:
+        """Match a frame to the last keyframes or, once it is lost, to those that look most alike; `matches` are to the reference."""
         settings = self._config.relocalization
         if place.lost_frames == 0:
             candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
         else:
-            looks = features if view is None else view.features
-            candidates = similar_keyframes(place.map, place.places, looks, place.reference_id, settings.keyframes)
-        if view is not None:
-            candidates = [place.reference_id, *candidates]
+            candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
         least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
-        matcher = self._matcher if view is None else TurnedMatcher(self._matcher, view)
-        known = {place.reference_id: matches} if matches is not None else {}
-        return relocalize(place.map, features, candidates, matcher, self._config, least, known)
+        return relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:
