@@ -103,7 +103,7 @@ def test_the_extractor_sees_the_preprocessed_image() -> None:
     slam = make(walk_world(), WALK)
     image = (picture(0).astype(np.uint16) * 3 + 20000).astype(np.uint16)
     slam.process(Frame(stamp(0), 0, image))
-    (given,) = slam._extractor.images  # type: ignore[attr-defined]
+    (given,) = slam._extractor._inner.images  # type: ignore[attr-defined]
     assert given.dtype == np.uint8 and given.shape == (HEIGHT, WIDTH)
     assert given.min() == 0 and given.max() == 255
 
@@ -120,7 +120,7 @@ def test_a_kidnapped_camera_relocalises_when_it_is_put_back() -> None:
     far = World(walk_world().points + [0, 0, 500], walk_world().descriptors, walk_world().scores)
     slam = make(walk_world(), path)
     for i in range(25, 29):
-        del slam._extractor.poses_by_stamp[stamp(i)]  # type: ignore[attr-defined]
+        del slam._extractor._inner.poses_by_stamp[stamp(i)]  # type: ignore[attr-defined]
     results, run = play(slam, frames(40))
     assert len(far.points) and {r.state for r in results[25:29]} == {TrackingState.LOST}
     assert {r.state for r in results[29:]} == {TrackingState.TRACKING}
