@@ -11,16 +11,17 @@ import signal
 import threading
 import time
 import traceback
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from thegra_core.config import ThegraConfig
 from thegra_core.errors import InputError, ThegraError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame, MapSummary, Snapshot, TrackingResult
 from thegra_core.process import keep_freed_memory, set_threads
+from thegra_ros.image_slot import make_slot, put, take
 
 if TYPE_CHECKING:
     from thegra_core.features.protocols import Extractor, Matcher
@@ -181,7 +182,8 @@ class ProcessEngine:
     def __init__(self, config: ThegraConfig) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=serve, args=(theirs, config), daemon=True, name="thegra engine")
+        self._slot = make_slot(context)
+        self._process = context.Process(target=serve, args=(theirs, config, self._slot), daemon=True, name="thegra engine")
         self._theirs = theirs
         self._sending = threading.Lock()
 
@@ -193,7 +195,7 @@ class ProcessEngine:
             raise answer
 
     def process(self, job: Job) -> Done:
-        answer = self._ask(job)
+        answer = self._ask(replace(job, frame=put(self._slot, job.frame)))
         assert isinstance(answer, Done)
         return answer
 
@@ -240,7 +242,7 @@ class ProcessEngine:
         return f"the process of the SLAM system has ended with code {code}" + (" (killed; out of memory?)" if code == -signal.SIGKILL else "")
 
 
-def serve(connection: Connection, config: ThegraConfig) -> None:
+def serve(connection: Connection, config: ThegraConfig, slot: Any) -> None:
     """Work on jobs and orders until told to end or the other end is gone; runs in the engine's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to the whole group; the node tells when to end
     logging.basicConfig(level=logging.INFO, format="[thegra engine] %(levelname)s %(message)s")
@@ -262,7 +264,7 @@ def serve(connection: Connection, config: ThegraConfig) -> None:
         if asked is None:
             return
         try:
-            answer: object = engine.process(asked) if isinstance(asked, Job) else engine.obey(asked)
+            answer: object = engine.process(replace(asked, frame=take(slot, asked.frame))) if isinstance(asked, Job) else engine.obey(asked)
         except (EngineError, ThegraError) as error:
             answer = error
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import threading
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from thegra_core.errors import InputError, WeightsError
 from thegra_core.messages import Frame, TrackingResult, TrackingState
 from thegra_core.simulation.cameras import thermal_camera
 from thegra_ros.engine import Done, EngineError, Job, LocalEngine, Order, SaveMap
+from thegra_ros.image_slot import MOST_BYTES, make_slot, put, take
 from thegra_ros.worker import MOST_FAILURES, NotWorkingError, Worker
 
 LIMIT_S = 60
@@ -167,3 +169,20 @@ def test_another_epoch_begins_a_new_map(monkeypatch: pytest.MonkeyPatch) -> None
         engine.process(Job(Frame(9, 9, np.zeros((2, 2), np.uint8)), camera, 1))
     engine.process(Job(Frame(10, 10, np.zeros((2, 2), np.uint8)), camera, 1))
     assert len(made) == 3, "what failed may be in any state"
+
+
+@pytest.mark.parametrize("image", [np.arange(12, dtype=np.uint16).reshape(3, 4), np.arange(24, dtype=np.float32).reshape(4, 6)[::2, ::3], np.zeros((0, 5), np.uint8)])
+def test_an_image_comes_out_of_the_slot_as_it_was_put(image: np.ndarray) -> None:
+    slot = make_slot(multiprocessing.get_context("spawn"))
+    put(slot, Frame(1, 0, np.full((9, 9), 7, np.uint16)))
+    left = put(slot, Frame(2, 5, image))
+    taken = take(slot, left)
+    put(slot, Frame(3, 1, np.full((9, 9), 7, np.uint16)))
+    assert (taken.stamp_ns, taken.index, taken.image.dtype) == (2, 5, image.dtype)
+    np.testing.assert_array_equal(taken.image, image)
+
+
+def test_an_image_without_room_in_the_slot_goes_as_it_is() -> None:
+    slot = make_slot(multiprocessing.get_context("spawn"))
+    large = Frame(2, 5, np.zeros((MOST_BYTES // 1000 + 1, 1000), np.uint8))
+    assert put(slot, large) is large and take(slot, large) is large

@@ -57,9 +57,12 @@ def ros(
         return
     width, height = content["image_size"]
     typer.echo(f"{width}x{height}, {config.extractor.name}, {rate:g} frames a second, {len(frames)} frames")
-    typer.echo(f"{'':<16}{'frames':>8}{'direct ms':>11}{'by ROS ms':>11}{'overhead ms':>13}{'p95':>8}{'target':>8}")
+    typer.echo(f"{'no keyframes:':<16}{'frames':>8}{'direct ms':>11}{'by ROS ms':>11}{'overhead ms':>13}{'p95':>8}{'target':>8}   keyframes: overhead ms")
     for row in content["graphs"]:
-        typer.echo(f"{row['graph']:<16}{row['frames']:>8}{row['direct_ms']:>11.1f}{row['ros_ms']:>11.1f}{row['overhead_ms']:>13.2f}{row['overhead_p95_ms']:>8.2f}{row['target_ms']:>8.0f}")
+        keyframes = f"{row['keyframe_overhead_ms']:.2f} ({row['keyframes']})" if row["keyframes"] else "-"
+        typer.echo(
+            f"{row['graph']:<16}{row['frames']:>8}{row['direct_ms']:>11.1f}{row['ros_ms']:>11.1f}{row['overhead_ms']:>13.2f}{row['overhead_p95_ms']:>8.2f}{row['target_ms']:>8.0f}   {keyframes}"
+        )
 
 
 def soak(

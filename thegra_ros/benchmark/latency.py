@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -34,7 +34,10 @@ DISCOVERY_LIMIT_S, SETTLE_S, LAST_POSE_S = 60.0, 2.0, 5.0
 
 @dataclass(frozen=True, slots=True)
 class Overhead:
-    """Milliseconds from image to pose by way of ROS, directly, and their difference frame by frame; over frames that did not wait for the one before."""
+    """Milliseconds from image to pose by way of ROS, directly, and their difference frame by frame; over frames that did not wait for the one before.
+
+    Keyframes are told apart: called directly a keyframe's pose waits for mapping, from the four nodes it does not.
+    """
 
     graph: str
     frames: int
@@ -42,6 +45,8 @@ class Overhead:
     ros_ms: float
     overhead_ms: float
     overhead_p95_ms: float
+    keyframes: int
+    keyframe_overhead_ms: float | None
     target_ms: float
 
 
@@ -63,32 +68,48 @@ def benchmark(frames: Sequence[Frame], camera: CameraModel, config: ThegraConfig
     return {"image_size": [width, height], "frames": len(frames), "rate_hz": rate_hz, "extractor": config.extractor.name, "graphs": [asdict(item) for item in found]}
 
 
-def compare(graph: str, alone: dict[int, float], by_ros: dict[int, float]) -> Overhead:
+@dataclass(frozen=True, slots=True)
+class Alone:
+    """A frame by the system called directly."""
+
+    ms: float
+    is_keyframe: bool
+
+
+def compare(graph: str, alone: dict[int, Alone], by_ros: dict[int, float]) -> Overhead:
     """Both times of the frames that have both.
 
     Raises:
-        InputError: If there are none.
+        InputError: If there is none but keyframes.
     """
     both = sorted(set(alone) & set(by_ros))
-    if not both:
-        raise InputError(f"{graph}: no frame has a pose that did not wait for the frame before; a lower --rate helps")
-    direct_ms, ros_ms = np.array([alone[stamp] for stamp in both]), np.array([by_ros[stamp] for stamp in both])
-    difference = ros_ms - direct_ms
-    return Overhead(graph, len(both), *(round(float(x), 2) for x in (np.median(direct_ms), np.median(ros_ms), np.median(difference), np.percentile(difference, 95))), TARGETS_MS[graph])
+    plain = [stamp for stamp in both if not alone[stamp].is_keyframe]
+    if not plain:
+        raise InputError(f"{graph}: no frame but keyframes has a pose that did not wait for the frame before; a lower --rate helps")
+    difference = {stamp: by_ros[stamp] - alone[stamp].ms for stamp in both}
+    of_plain, of_keyframes = ([d for stamp, d in difference.items() if alone[stamp].is_keyframe is kind] for kind in (False, True))
+    return Overhead(
+        graph, len(plain), _median([alone[s].ms for s in plain]), _median([by_ros[s] for s in plain]), _median(of_plain),
+        round(float(np.percentile(of_plain, 95)), 2), len(of_keyframes), _median(of_keyframes) if of_keyframes else None, TARGETS_MS[graph],
+    )  # fmt: skip
 
 
-def direct(frames: Sequence[Frame], camera: CameraModel, config: ThegraConfig, rate_hz: float) -> dict[int, float]:
-    """Milliseconds of each tracked frame by its stamp."""
+def _median(values: Sequence[float]) -> float:
+    return round(float(np.median(values)), 2)
+
+
+def direct(frames: Sequence[Frame], camera: CameraModel, config: ThegraConfig, rate_hz: float) -> dict[int, Alone]:
+    """Each tracked frame by its stamp."""
     set_threads(config.threads)
     from thegra_core.slam import Slam
 
     slam = Slam(camera, config, keep_records=False)
-    taken: dict[int, float] = {}
-    for frame, _ in paced(frames, rate_hz):
+    taken: dict[int, Alone] = {}
+    for frame in paced(frames, rate_hz):
         begin = time.monotonic()
         result = slam.process(frame)
         if result.state is TrackingState.TRACKING:
-            taken[frame.stamp_ns] = 1e3 * (time.monotonic() - begin)
+            taken[frame.stamp_ns] = Alone(1e3 * (time.monotonic() - begin), result.is_keyframe)
     return taken
 
 
@@ -97,7 +118,7 @@ def camera_to_pose(frames: Sequence[Frame], camera: CameraModel, config: ThegraC
     sent: dict[int, float] = {}
     with running(nodes, config), _camera() as driver:
         driver.wait_for(BETWEEN_STAGES if len(nodes) > 1 else ())
-        for frame, _ in paced(frames, rate_hz):
+        for frame in paced(frames, rate_hz):
             stamped = header(frame.stamp_ns, "thermal_camera")
             driver.infos.publish(camera_info_message(stamped, camera))
             sent[frame.stamp_ns] = time.monotonic()
@@ -120,12 +141,12 @@ def unhindered(sent: dict[int, float], received: dict[int, float]) -> dict[int, 
     return taken
 
 
-def paced(frames: Sequence[Frame], rate_hz: float) -> Any:
-    """Frames with their place, each when its time has come."""
+def paced(frames: Sequence[Frame], rate_hz: float) -> Iterator[Frame]:
+    """The frames, each when its time has come."""
     due = time.monotonic()
-    for index, frame in enumerate(frames):
+    for frame in frames:
         time.sleep(max(0.0, due - time.monotonic()))
-        yield frame, index
+        yield frame
         due = max(due + 1.0 / rate_hz, time.monotonic())
 
 

@@ -28,7 +28,7 @@ MOST_GROWTH_PCT = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Seconds since the beginning; MB of all nodes with their processes; images received and dropped so far; maps begun so far; the state now."""
+    """Seconds since the beginning; MB of all nodes with their processes; images received and dropped so far; the state now."""
 
     time_s: float
     memory_mb: float

@@ -93,9 +93,9 @@ class TrackingNode(StageNode):
             return
         stage.localization_only = self._localizing
         output = _track(stage, item, camera)
+        self._poses.publish(output.result, self._place.frames)  # mapping changes nothing of it: it need not wait
         self._tell_mapping(stage, output, notice)
         self._tell_frontend(stage)
-        self._poses.publish(output.result, self._place.frames)
         self._told(output.result)
 
     def begin_anew(self, why: str) -> None:
