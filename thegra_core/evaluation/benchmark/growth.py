@@ -89,7 +89,7 @@ def write(samples: Sequence[Sample], folder: Path) -> None:
 def figure(samples: Sequence[Sample]) -> Figure:
     """Running medians of tracking a frame and mapping a keyframe over the run, above the size of the map."""
     minutes = np.arange(len(samples)) * PERIOD_NS / 60e9
-    keyframes = np.flatnonzero([s.is_keyframe for s in samples])
+    keyframes = [i for i, s in enumerate(samples) if s.is_keyframe]
     drawn = Figure(figsize=(7, 5), layout="constrained")
     times, sizes = drawn.subplots(2, 1, sharex=True)
     times.plot(minutes, _running_median([s.tracking_ms for s in samples]), label="tracking a frame")
