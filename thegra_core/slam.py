@@ -16,6 +16,7 @@ from thegra_core.config import ThegraConfig
 from thegra_core.errors import InputError
 from thegra_core.features.protocols import Extractor, Matcher
 from thegra_core.features.registry import make_extractor, make_matcher
+from thegra_core.features.turning import TurningMatcher, turned_features
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
@@ -34,7 +35,6 @@ from thegra_core.messages import (
     TrackingState,
 )
 from thegra_core.optimization.solver import BundleSolver
-from thegra_core.places.turning import TurningMatcher, turned_features
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
 from thegra_core.snapshots import SnapshotKeeper

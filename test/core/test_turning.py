@@ -11,9 +11,9 @@ from synthetic import CAMERA, FakeMatcher, look, make_world, observe, stamp
 from test_slam import ate, play
 
 from thegra_core.config import ThegraConfig, load_config
+from thegra_core.features.turning import TurningMatcher, turned_features, turned_pixels
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.messages import Features, Frame, Matches, TrackingState
-from thegra_core.places.turning import TurningMatcher, turned_features, turned_pixels
 from thegra_core.slam import Slam
 
 WIDTH, HEIGHT = CAMERA.image_size
