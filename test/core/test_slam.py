@@ -280,7 +280,7 @@ def test_few_keypoints_never_crash() -> None:
     """A world of a handful of points: not enough for a map, at any number."""
     for count in (1, 3, 8, 20):
         slam = make(cloud(count=count, seed=3), WALK)
-        slam._extractor.clutter = 0  # type: ignore[attr-defined]
+        slam._extractor._inner.clutter = 0  # type: ignore[attr-defined]
         _, run = play(slam, frames(6))
         assert run.main_map_id == -1
 

@@ -7,7 +7,7 @@ orientation, chosen so that they look like the map; what is told of them, their 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,23 +52,20 @@ class TurnableExtractor:
         return turned_features(image, stamp_ns, (self.turns + further) % 4, self._inner)
 
 
-@dataclass(frozen=True, slots=True)
 class TurningMatcher:
     """`Matcher` that shows another one the features of each image as they were found, in the turned image."""
 
-    inner: Matcher
-
-    @property
-    def name(self) -> str:
-        return self.inner.name
+    def __init__(self, inner: Matcher) -> None:
+        self.name = inner.name
+        self._inner = inner
 
     def match(self, query: Features, reference: Features) -> Matches:
         """See `Matcher.match`."""
-        return self.inner.match(_as_found(query), _as_found(reference))
+        return self._inner.match(_as_found(query), _as_found(reference))
 
     def match_many(self, query: Features, references: Sequence[Features]) -> list[Matches]:
         """See `Matcher.match_many`."""
-        return self.inner.match_many(_as_found(query), [_as_found(reference) for reference in references])
+        return self._inner.match_many(_as_found(query), [_as_found(reference) for reference in references])
 
 
 def _as_found(features: Features) -> Features:

@@ -87,7 +87,7 @@ class StreetExtractor:
         return self.street.see(self._next - 1, stamp_ns)
 
 
-@dataclass(frozen=True)
+@dataclass
 class EqualDescriptors:
     """`Matcher` that pairs what has the same descriptor."""
 

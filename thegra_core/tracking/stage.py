@@ -414,7 +414,7 @@ class TrackingStage:
         if found is not None:
             place.reference_id = found[1]
             return self._accept(place, features, found[0], found[2])
-        for other in turned:
+        for other in turned if place.lost_frames < self._config.relocalization.new_map_after_frames else ():
             found = self._seek(place, other, self._matcher.match(other, place.reference))
             if found is not None:
                 place.reference_id = found[1]
