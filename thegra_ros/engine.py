@@ -76,10 +76,11 @@ class Engine(Protocol):
 
 
 class LocalEngine:
-    """The system in the calling thread."""
+    """The system in the calling thread; `beside`: but for mapping, which then has a process of its own."""
 
-    def __init__(self, config: ThegraConfig) -> None:
+    def __init__(self, config: ThegraConfig, beside: bool = False) -> None:
         self._config = config
+        self._beside = beside
         self._networks: tuple[Extractor, Matcher] | None = None
         self._slam: Slam | None = None
         self._epoch = -1
@@ -97,11 +98,13 @@ class LocalEngine:
             view = slam.snapshot() if job.wants_view else None
             return Done(result, view, slam.current_map() if job.wants_map else None)
         except Exception as error:
-            self._slam = None
+            self.stop()
             raise EngineError(traceback.format_exc()) from error
 
     def stop(self) -> None:
-        pass
+        if self._slam is not None:
+            self._slam.close()
+        self._slam = None
 
     def _slam_for(self, job: Job) -> Slam:
         if self._slam is None or job.epoch != self._epoch:
@@ -109,7 +112,8 @@ class LocalEngine:
 
             if self._networks is None:
                 self.start()
-            self._slam, self._epoch = Slam(job.camera, self._config, *(self._networks or ())), job.epoch
+            self.stop()
+            self._slam, self._epoch = Slam(job.camera, self._config, *(self._networks or ()), beside=self._beside), job.epoch
         return self._slam
 
 
@@ -175,7 +179,7 @@ def serve(connection: Connection, config: ThegraConfig) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to the whole group; the node tells when to end
     logging.basicConfig(level=logging.INFO, format="[thegra engine] %(levelname)s %(message)s")
     keep_freed_memory()
-    engine = LocalEngine(config)
+    engine = LocalEngine(config, beside=True)
     begin = time.perf_counter()
     try:
         engine.start()
@@ -184,6 +188,13 @@ def serve(connection: Connection, config: ThegraConfig) -> None:
         return
     connection.send("ready")
     _log.info("networks loaded in %.1f s", time.perf_counter() - begin)
+    try:
+        _answer(connection, engine)
+    finally:
+        engine.stop()
+
+
+def _answer(connection: Connection, engine: LocalEngine) -> None:
     while True:
         try:
             job = connection.recv()
