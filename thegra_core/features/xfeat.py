@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +29,7 @@ class XFeat:
         self.name: str = config.name
         self._config = config
         self._device = resolve_device(config.device)
-        pipeline = XFeatPipeline(top_k=config.max_keypoints, detection_threshold=config.detection_threshold)
+        pipeline: Any = XFeatPipeline(top_k=config.max_keypoints, detection_threshold=config.detection_threshold)
         load_exactly(pipeline.net, load_checkpoint("xfeat"), "xfeat")
         self._pipeline = pipeline.eval().to(self._device)
         runtime = chosen(config.backend, self._device)
