@@ -125,6 +125,23 @@ def run(
     raise typer.Exit(run_recording(options))
 
 
+@app.command("export-models")
+def export_models(
+    size: Annotated[list[str] | None, typer.Option(metavar="WxH", help="Image size; repeatable. Default: 640x512 and 320x256.")] = None,
+) -> None:
+    """Write XFeat's network as ONNX files where the backends onnxruntime and openvino look for them.
+
+    Example: `thegra export-models --size 640x512`
+
+    Without this command it is done at the first run with such a backend, which then takes some seconds longer. It needs `pip install onnx onnxscript`.
+    """
+    from thegra_core.cli.simulate import image_size
+    from thegra_core.features.xfeat import export_xfeat
+
+    for text in size or ("640x512", "320x256"):
+        typer.echo(export_xfeat(image_size(text)))
+
+
 @app.command()
 def info(
     recording: Annotated[Path, typer.Argument(metavar="INPUT", help="ROS 1 or 2 bag, .mcap, image folder (with images.txt or plain) or video.")],

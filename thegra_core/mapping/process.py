@@ -35,6 +35,8 @@ from thegra_core.process import Usage, keep_freed_memory, own_usage
 logger = logging.getLogger(__name__)
 LAST_WORDS_S = 5.0
 """How long an ending process may take before it is killed."""
+NICENESS = 10
+"""Tracking goes first where cores are few."""
 _END = None
 _LAUNCH = f"import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); from {__name__} import main; main()"
 """A terminal sends Ctrl-C to all processes, but it is meant for tracking, which tells when to end: it is ignored before anything else is imported."""
@@ -225,6 +227,7 @@ def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...]) -> tuple[
 
 def main() -> None:
     """The process: its argument is the file descriptor of the connection."""
+    os.nice(NICENESS)
     logging.basicConfig(level=logging.WARNING, format="[thegra mapping] %(levelname)s %(message)s")
     keep_freed_memory()
     serve(Connection(int(sys.argv[1])))

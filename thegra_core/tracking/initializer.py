@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,6 +127,7 @@ class Initializer:
         if ratio < needed:
             return f"no parallax: a pure rotation explains the matches to {flow:.1f} px, {ratio:.1f} times their noise, {needed:.1f} needed: move sideways"
         views = [reference, *self._between(), current]
+        views = [replace(view) for view in views]  # of its own: the reference may advance meanwhile
         return _Attempt(views, matches, self._submit(decide, self._tabulate(views, matches), hypotheses, self._config))
 
     def _between(self) -> list[_Candidate]:
