@@ -267,12 +267,12 @@ def serve(connection: Connection, config: ThegraConfig, slot: Any) -> None:
     connection.send("ready")
     _log.info("networks loaded in %.1f s", time.perf_counter() - begin)
     try:
-        _answer(connection, engine)
+        _answer(connection, engine, slot)
     finally:
         engine.stop()
 
 
-def _answer(connection: Connection, engine: LocalEngine) -> None:
+def _answer(connection: Connection, engine: LocalEngine, slot: Any) -> None:
     while True:
         try:
             asked = connection.recv()
