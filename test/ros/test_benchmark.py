@@ -17,7 +17,7 @@ from ros_graph import FAST, LIMIT_S
 from thegra_core.errors import InputError
 from thegra_ros.benchmark.latency import Alone, compare, unhindered
 from thegra_ros.benchmark.processes import descendants, resident_mb
-from thegra_ros.benchmark.soak import Sample, summary
+from thegra_ros.benchmark.soak import Plan, Sample, summary
 
 SET = [argument for name, value in FAST.items() if name != "profile" for argument in ("--set", f"{name}={'[{filter: he_clip}]' if name == 'preprocessing.filters' else value}")]
 
@@ -41,9 +41,9 @@ def test_frames_that_waited_for_the_one_before_are_left_out() -> None:
 
 @pytest.mark.parametrize(("per_s", "grown"), [(0.0, 0.0), (1.0, 24.0 / 1.12)])
 def test_growth_is_told_after_the_warm_up(per_s: float, grown: float) -> None:
-    """Half a minute; the first fifth, in which networks are loaded, does not count."""
+    """Half a minute; the first six seconds, in which networks are loaded, do not count."""
     samples = [Sample(float(t), 10.0 if t < 6 else 106.0 + per_s * t, 15 * t, t, "tracking" if t > 17 else "lost") for t in range(31)]
-    told = summary(samples, 0.5, "one process", 15.0)
+    told = summary(samples, Plan(0.5, 6.0, 15.0, 10.0, "one process"))
     assert told["growth_pct"] == pytest.approx(grown, abs=0.01)
     assert (told["images"], told["dropped"], told["tracking_pct"]) == (450, 30, 52.0)
 
@@ -70,9 +70,9 @@ def test_the_latency_of_both_graphs_is_measured(recording_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("minutes", [1.5, pytest.param(10.0, marks=pytest.mark.skipif("THEGRA_LONG_SOAK" not in os.environ, reason="set THEGRA_LONG_SOAK=1 for the ten minutes"))])
-def test_memory_stays_over_many_turns(recording_path: Path, minutes: float) -> None:
-    command = [sys.executable, "-m", "thegra_core.cli.main", "benchmark", "soak", str(recording_path), "--minutes", str(minutes), "--json", *SET]
+@pytest.mark.parametrize(("minutes", "warm_up_s"), [(3, 90), pytest.param(10, 120, marks=pytest.mark.skipif("THEGRA_LONG_SOAK" not in os.environ, reason="set THEGRA_LONG_SOAK=1 for the ten minutes"))])
+def test_memory_stays_over_many_turns(recording_path: Path, minutes: int, warm_up_s: int) -> None:
+    command = [sys.executable, "-m", "thegra_core.cli.main", "benchmark", "soak", str(recording_path), "--minutes", str(minutes), "--warm-up", str(warm_up_s), "--json", *SET]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode in (0, 1), done.stderr
     told = json.loads(done.stdout)

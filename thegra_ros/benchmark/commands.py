@@ -67,31 +67,36 @@ def ros(
 
 def soak(
     recording: InputArgument = None,
-    minutes: Annotated[float, typer.Option(min=0.05, help="How long; memory counts after the first fifth.")] = 10.0,
+    minutes: Annotated[float, typer.Option(min=0.05, help="How long.")] = 10.0,
+    warm_up: Annotated[float, typer.Option(metavar="S", min=0.0, help="Seconds at the beginning that do not count.")] = 120.0,
     rate: Annotated[float, typer.Option(min=0.1, help="Frames a second.")] = 15.0,
     stages: Annotated[bool, typer.Option("--stages", help="The four nodes in place of one.")] = False,
     profile: ProfileOption = "fast",
     set_: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Play a recording over and over into the node and watch its memory. Exit code 1: it grew by more than 5 % after the first fifth of the time.
+    """Play a recording over and over into the node and watch its memory. Exit code 1: it grew by more than 5 % after the warm-up.
 
     Example: `thegra benchmark soak flight.mcap --minutes 10 --rate 15`
     """
     need_ros("thegra benchmark soak")
     from thegra_ros.benchmark.processes import use_own_domain
+    from thegra_ros.benchmark.soak import Plan
     from thegra_ros.benchmark.soak import soak as go
+
+    if 60 * minutes < warm_up + 10:
+        raise ConfigError(f"--minutes {minutes:g} leaves nothing after a warm-up of {warm_up:g} s: give more, or a shorter --warm-up")
 
     use_own_domain()
     config = _config(profile, set_)
     with _recording(recording) as opened, _status() as say:
-        content = go(opened.path, config, minutes, rate, _rate_of(opened), "four processes" if stages else "one process", say)
+        content = go(opened.path, config, Plan(minutes, warm_up, rate, _rate_of(opened), "four processes" if stages else "one process"), say)
     if as_json:
         typer.echo(json.dumps(content, indent=2))
     else:
         typer.echo(
             f"{content['graph']}, {minutes:g} minutes at {rate:g} frames a second: {content['images']} images received, {content['dropped']} of them dropped, "
-            f"tracking for {content['tracking_pct']} % of the time\nmemory {content['warm_mb']} MB after a fifth of the time, growth {content['growth_pct']} %, peak {content['peak_mb']} MB"
+            f"tracking for {content['tracking_pct']} % of the time\nmemory {content['warm_mb']} MB after {warm_up:g} s, from then on growth {content['growth_pct']} %, peak {content['peak_mb']} MB"
         )
     if content["growth_pct"] > content["most_growth_pct"]:
         raise typer.Exit(1)

@@ -37,34 +37,45 @@ class Sample:
     state: str
 
 
-def soak(recording: Path, config: ThegraConfig, minutes: float, rate_hz: float, recorded_hz: float, graph: str, say: Callable[[str], None]) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How long; how much of that, at the beginning, does not count; frames a second as played and as recorded; and into which graph."""
+
+    minutes: float
+    warm_up_s: float
+    rate_hz: float
+    recorded_hz: float
+    graph: str
+
+
+def soak(recording: Path, config: ThegraConfig, plan: Plan, say: Callable[[str], None]) -> dict[str, Any]:
     """Play for so long; what became of memory.
 
     Raises:
         InputError: If a node or the player ended.
     """
     samples: list[Sample] = []
-    play = [sys.executable, "-m", "thegra_core.cli.main", "play", str(recording), "--loop", "--rate", f"{rate_hz / recorded_hz:.6g}", "--namespace", NAMESPACE, "--wait", "60"]
-    with running(GRAPHS[graph], config) as nodes, _listener() as facts, _process(play) as player:
+    play = [sys.executable, "-m", "thegra_core.cli.main", "play", str(recording), "--loop", "--rate", f"{plan.rate_hz / plan.recorded_hz:.6g}", "--namespace", NAMESPACE, "--wait", "60"]
+    with running(GRAPHS[plan.graph], config) as nodes, _listener() as facts, _process(play) as player:
         begin = time.monotonic()
-        while (now := time.monotonic() - begin) < 60 * minutes:
+        while (now := time.monotonic() - begin) < 60 * plan.minutes:
             facts.spin(SAMPLE_S)
             ended = next((p for p in (*nodes, player) if p.poll() is not None), None)
             if ended is not None:
                 raise InputError(f"a process has ended with {ended.returncode} after {now:.0f} s")
             samples.append(Sample(round(now, 1), round(sum(resident_mb(p.pid) for p in nodes), 1), facts.count("images"), facts.count("dropped"), facts.state))
             say(f"{now:.0f} s, {samples[-1].memory_mb:.0f} MB")
-    return summary(samples, minutes, graph, rate_hz)
+    return summary(samples, plan)
 
 
-def summary(samples: list[Sample], minutes: float, graph: str, rate_hz: float) -> dict[str, Any]:
-    """Growth of memory after a fifth of the time: the line through what follows, over its own beginning, per cent."""
-    warm = [s for s in samples if s.time_s >= 12 * minutes]
+def summary(samples: list[Sample], plan: Plan) -> dict[str, Any]:
+    """Growth of memory after the warm-up: of the line through what follows, over its own beginning, per cent."""
+    warm = [s for s in samples if s.time_s >= plan.warm_up_s]
     times, memory = np.array([s.time_s for s in warm]), np.array([s.memory_mb for s in warm])
     slope, start = np.polyfit(times - times[0], memory, 1)
     growth = 100.0 * slope * (times[-1] - times[0]) / start
     return {
-        "graph": graph, "minutes": minutes, "rate_hz": rate_hz, "images": samples[-1].images, "dropped": samples[-1].dropped,
+        "graph": plan.graph, "minutes": plan.minutes, "warm_up_s": plan.warm_up_s, "rate_hz": plan.rate_hz, "images": samples[-1].images, "dropped": samples[-1].dropped,
         "tracking_pct": round(100.0 * sum(s.state == "tracking" for s in warm) / len(warm), 1), "warm_mb": round(float(start), 1),
         "peak_mb": max(s.memory_mb for s in samples), "growth_pct": round(float(growth), 2), "most_growth_pct": MOST_GROWTH_PCT,
         "samples": [asdict(s) for s in samples],
