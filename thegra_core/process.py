@@ -26,12 +26,16 @@ def set_threads(count: int) -> None:
     A brief wait is near the better of the two in both cases (measured).
 
     Args:
-        count: 0: one a core, `MOST_THREADS` at most. `OMP_NUM_THREADS` wins over it.
+        count: 0: one a core, `MOST_THREADS` at most. `OMP_NUM_THREADS` wins over it. A count given is OpenCV's, too, which else takes all cores.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     os.environ.setdefault("OMP_NUM_THREADS", str(count or min(cores, MOST_THREADS)))
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+    if count:
+        import cv2
+
+        cv2.setNumThreads(count)
 
 
 def keep_freed_memory() -> None:

@@ -25,7 +25,7 @@ class Playback:
         clock: Seconds, monotonic.
     """
 
-    def __init__(self, frames: Iterator[Frame], waiting: int = 2, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, frames: Iterator[Frame], waiting: int = 3, clock: Callable[[], float] = time.monotonic) -> None:
         self.dropped = 0
         self._frames = frames
         self._clock = clock
