@@ -6,19 +6,17 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ros]")
 
-import itertools
-from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from rcl_interfaces.srv import SetParameters
 from ros_graph import OFFLINE, Graph, set_parameter
+from stages import Stages, again, value
 from std_srvs.srv import SetBool, Trigger
 
 from thegra_core.config import load_config
-from thegra_core.messages import Frame, Shutter, ShutterState, TrackingState
+from thegra_core.messages import Shutter, ShutterState, TrackingState
 from thegra_core.outputs.scoring import align
 from thegra_core.outputs.trajectory import read_tum
 from thegra_core.slam import Slam
@@ -27,8 +25,6 @@ from thegra_ros.codec.shutter import FrameNotice, notice_message, read_notice
 from thegra_ros.codec.stamps import stamp_ns
 from thegra_ros.joiner import MOST_PENDING, FrameJoiner
 from thegra_ros.transforms import Frames, map_pose
-
-STAGES = ("preprocessing", "frontend", "tracking", "mapping")
 
 
 @given(st.integers(0, 2**31 * 10**9 - 1), st.sampled_from(Shutter), st.text(st.characters(codec="utf-8", exclude_characters="\0")), st.booleans(), st.integers(0, 99))
@@ -64,72 +60,6 @@ def test_a_frame_that_lost_a_part_holds_nothing_up() -> None:
     joined.add("notice", 2, "open")
     assert joined.add("features", 2, "f2") == [{"notice": "open", "features": "f2"}]
     assert joined.lost == 1
-
-
-def value(graph: Graph, node: str, key: str) -> int:
-    """What a node last said on /diagnostics."""
-    for message in reversed(graph.received["/diagnostics"]):
-        if message.status[0].name.endswith(node):
-            return int(next((v.value for v in message.status[0].values if v.key == key), "0"))
-    return 0
-
-
-def noisy_copies(frame: Frame, begin_ns: int) -> Iterator[Frame]:
-    """Images of a camera that stands still, a tenth of a second apart."""
-    rng = np.random.default_rng(0)
-    for step in itertools.count():
-        noise = rng.normal(0, 5, frame.image.shape)
-        yield Frame(begin_ns + step * 100_000_000, 0, (frame.image + noise).astype(np.uint16))
-
-
-_clock = itertools.count(1)
-
-
-def again(frames: list[Frame]) -> Iterator[Frame]:
-    """The frames with stamps that go on rising, a tenth of a second apart."""
-    for frame in frames:
-        yield replace(frame, stamp_ns=1_700_000_100_000_000_000 + next(_clock) * 100_000_000)
-
-
-class Stages:
-    """The four nodes; frames go in step, so that each is matched to the newest reference."""
-
-    def __init__(self, graph: Graph, camera, first: Frame, **parameters: dict[str, str]) -> None:
-        self.graph = graph
-        self.nodes = {name: graph.start(f"thegra_ros.nodes.{name}", parameters.get(name)) for name in STAGES}
-        graph.wait(lambda: all(self.works(name) for name in STAGES), "four nodes")
-        graph.send_camera(camera, listeners=2)
-        warm_up = noisy_copies(first, first.stamp_ns + 100 * 10**9)  # a stream finds its listeners; what is sent before is lost
-        while self.value("tracking", "processed") == 0:
-            graph.send([next(warm_up)])
-            graph.spin_for(1.0)
-        graph.send([next(noisy_copies(first, first.stamp_ns - 100_000_000))])  # stamps go back: with the second image, the test's first, all begins anew
-
-    def works(self, name: str) -> bool:
-        return any(m.status[0].name.endswith(name) and m.status[0].message != "the node is not active" for m in self.graph.received["/diagnostics"])
-
-    def value(self, node: str, key: str) -> int:
-        return value(self.graph, node, key)
-
-    def send(self, frames: list[Frame]) -> None:
-        for frame in frames:
-            done = self.value("tracking", "processed")
-            self.graph.send([frame])
-            self.graph.wait(lambda n=done: self.value("tracking", "processed") > n, f"frame {frame.index}")
-
-    def restart(self, name: str, camera) -> None:
-        """Kill a node, and start it again."""
-        self.nodes[name].process.kill()
-        self.nodes[name].process.wait()
-        self.graph.forget(self.nodes[name])
-        self.graph.received["/diagnostics"].clear()
-        self.nodes[name] = self.graph.start(f"thegra_ros.nodes.{name}")
-        self.graph.wait(lambda: self.works(name), f"{name} again")
-        if name in ("tracking", "mapping"):
-            self.graph.send_camera(camera, listeners=2)
-
-    def end(self) -> list[int]:
-        return [node.end() for node in self.nodes.values()]
 
 
 @pytest.mark.slow

@@ -121,7 +121,7 @@ def test_the_map_goes_on_when_the_link_was_cut(hosts: Hosts, recording_path: Pat
     else:
         hosts.node("base", "slam", "-p", f"image_transport:={split}")
         works_on_poses = "slam"
-    hosts.run("robot", "camera", str(PARTS), "camera", str(recording_path), "compressed" if split == "compressed" else "raw")
+    hosts.run("robot", "camera", str(PARTS), "camera", str(recording_path), "compressed" if split == "compressed" else "raw", works_on_poses)
 
     def lines() -> list[dict[str, str]]:
         return [json.loads(line) for line in heard.read_text().splitlines() if line.endswith("}")] if heard.exists() else []

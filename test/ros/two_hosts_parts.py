@@ -19,10 +19,11 @@ from thegra_ros.codec.images import camera_info_message, image_message
 from thegra_ros.codec.stamps import header, stamp_ns
 from thegra_ros.qos import LOSSLESS, RELIABLE
 
-PERIOD_S = 0.4
+LEAST_S, MOST_S = 0.2, 1.5
+"""Between two images: until the frame before is done, but no longer, for the link may be cut."""
 
 
-def camera(recording: str, transport: str) -> None:
+def camera(recording: str, transport: str, works: str) -> None:
     """Publish the frames forwards, backwards, forwards, ... with stamps that rise, so that every place is seen again."""
     opened = open_recording(Path(recording))
     frames, model = list(opened.frames()), camera_for(opened, None)
@@ -30,6 +31,8 @@ def camera(recording: str, transport: str) -> None:
     raw = transport == "raw"
     images = node.create_publisher(Image if raw else CompressedImage, "image_raw" if raw else "image_raw/compressed", RELIABLE)
     infos = node.create_publisher(CameraInfo, "camera_info", RELIABLE)
+    done: list[int] = [0]
+    node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: done.extend(processed(m, works)), LOSSLESS)
     for count, frame in enumerate(itertools.cycle([*frames, *frames[-2:0:-1]])):
         stamped = header(frames[0].stamp_ns + count * 100_000_000, "thermal_camera")
         infos.publish(camera_info_message(stamped, model))
@@ -39,7 +42,14 @@ def camera(recording: str, transport: str) -> None:
             message = CompressedImage(header=stamped, format="mono16; png compressed")
             message.data.frombytes(cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
             images.publish(message)
-        time.sleep(PERIOD_S)
+        begin, before = time.monotonic(), done[-1]
+        while (passed := time.monotonic() - begin) < LEAST_S or (passed < MOST_S and done[-1] == before):
+            rclpy.spin_once(node, timeout_sec=0.1)
+
+
+def processed(message: DiagnosticArray, works: str) -> list[int]:
+    """How many frames the node of that name says it has worked on."""
+    return [int(v.value) for status in message.status if status.name.endswith(works) for v in status.values if v.key == "processed"]
 
 
 def listener(file: str) -> None:
