@@ -30,10 +30,10 @@ def test_a_frame_of_the_street_is_its_points_seen_from_there() -> None:
 
 def test_summary_by_hand() -> None:
     """A hundred frames, every other a keyframe; costs double over the run."""
-    samples = [Sample(10.0 + 0.1 * i, 100.0 + i if i % 2 else 0.0, i % 2 == 1, i >= 4, i // 2, 10 * i, 200.0 + i) for i in range(100)]
+    samples = [Sample(100.0 + i if i % 2 else 10.0 + 0.1 * i, i % 2 == 1, i >= 4, i // 2, 10 * i, 200.0 + i) for i in range(100)]
     told = summary(samples)
-    assert told["tracking_ms"] == [pytest.approx(11.45), pytest.approx(19.45)]
-    assert told["mapping_ms"] == [115.0, 195.0] and told["mapping_growth"] == pytest.approx(195 / 115, abs=1e-3)
+    assert told["frame_cpu_ms"] == [pytest.approx(11.4), pytest.approx(19.4)]
+    assert told["keyframe_cpu_ms"] == [115.0, 195.0] and told["keyframe_growth"] == pytest.approx(195 / 115, abs=1e-3)
     assert (told["frames"], told["tracked_pct"], told["keyframes"]) == (100, 96.0, [9, 49])
     assert told["mb_per_keyframe"] == pytest.approx(80 / 40)
 
@@ -43,7 +43,7 @@ def test_the_command_writes_its_figures(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)
     written = json.loads((tmp_path / "growth.json").read_text(encoding="utf-8"))
-    assert written["summary"] == told and len(written["frames"]["tracking_ms"]) == told["frames"] == 60
+    assert written["summary"] == told and len(written["frames"]["cpu_ms"]) == told["frames"] == 60
     assert told["tracked_pct"] > 80 and told["keyframes"][1] > told["keyframes"][0] > 0
     assert (tmp_path / "growth.png").read_bytes().startswith(b"\x89PNG")
     wrong = CliRunner().invoke(app, ["benchmark", "growth", "--set", "nothing"])
