@@ -248,6 +248,7 @@ class InitializationConfig(Section):
 class TrackingConfig(Section):
     """Two-stage tracking."""
 
+    match_by: Literal["matcher", "nearest"] = Field("matcher", description="how frames are matched: by the configured matcher, or by nearest descriptors, which takes a fifteenth of LighterGlue's time (measured); mapping matches by the configured one")
     min_reference_matches: int = Field(15, ge=4, description="matches that see a landmark; ORB-SLAM3: 15")
     min_reference_inliers: int = Field(10, ge=4, description="ORB-SLAM3: 10")
     min_inliers: int = Field(25, ge=6, description="inliers after the second stage; ORB-SLAM3: 30, thermal frames have fewer points")

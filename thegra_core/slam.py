@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from thegra_core.config import ThegraConfig
 from thegra_core.errors import MappingError
 from thegra_core.features.front_end import DetectAndFollow, DetectEach
+from thegra_core.features.nearest import Nearest
 from thegra_core.features.protocols import Extractor, FrontEnd, Matcher, Wanted
 from thegra_core.features.registry import make_extractor, make_frame_matcher
 from thegra_core.features.tracks import shared_tracks
@@ -111,12 +112,15 @@ class Slam:
         self._masks = config.tracking.mask_fixed_pattern
         self._rotations = config.loop.rotations
         self._extractor = TurnableExtractor(extractor if extractor is not None else make_extractor(config.extractor))
-        self._matcher = make_frame_matcher(config, matcher)
+        nearest = Nearest(config.matcher) if config.tracking.match_by == "nearest" and matcher is None else None
+        self._matcher = make_frame_matcher(config, nearest or matcher)
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
         self._mapping: MappingService = (
-            MappingProcess(camera, config, make_frame_matcher) if beside else InlineMapping(Mapper(camera, config, self._matcher, solver))
+            MappingProcess(camera, config, make_frame_matcher)
+            if beside
+            else InlineMapping(Mapper(camera, config, self._matcher if nearest is None else make_frame_matcher(config), solver))
         )
         self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit)
         self._frames: list[_Placed] = []
