@@ -105,7 +105,7 @@ def test_updates_of_loops_are_exact() -> None:
 
 
 def test_a_frame_without_keypoints_keeps_its_facts() -> None:
-    nothing = Features(5, np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty((0, 64), np.float32), (640, 512), "xfeat")
+    nothing = Features(5, np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty((0, 64), np.float32), (640, 512), "xfeat", turns=3)
     assert same(table_features(*send([features_table(nothing)])), nothing)
 
 

@@ -73,7 +73,7 @@ def features_table(features: Features) -> Table:
     """x, y, score, descriptor of every keypoint."""
     width, height = features.image_size
     columns = {"x": features.keypoints[:, 0], "y": features.keypoints[:, 1], "score": features.scores, "descriptor": features.descriptors}
-    return Table(columns, {"stamp_ns": str(features.stamp_ns), "extractor": features.extractor, "image_size": f"{width}x{height}"})
+    return Table(columns, {"stamp_ns": str(features.stamp_ns), "extractor": features.extractor, "image_size": f"{width}x{height}", "turns": str(features.turns)})
 
 
 def table_features(table: Table) -> Features:
@@ -81,7 +81,7 @@ def table_features(table: Table) -> Features:
     columns = table.columns
     width, height = table.facts["image_size"].split("x")
     keypoints = np.stack([columns["x"], columns["y"]], axis=1)
-    return Features(int(table.facts["stamp_ns"]), keypoints, columns["score"], columns["descriptor"], (int(width), int(height)), table.facts["extractor"])
+    return Features(int(table.facts["stamp_ns"]), keypoints, columns["score"], columns["descriptor"], (int(width), int(height)), table.facts["extractor"], turns=int(table.facts["turns"]))
 
 
 def matches_table(matches: Matches) -> Table:
