@@ -35,7 +35,10 @@ REQUIRES = [
 DASK = ["distributed>=2024.1"]
 SIM = ["trimesh>=4.4", "embreex>=2.17.7"]
 TEST = ["pytest>=8", "pytest-timeout>=2.2", "hypothesis>=6.100", "evo>=1.28", "pytransform3d>=3.5", *SIM]
+ONNX = ["onnx>=1.17", "onnxscript>=0.3", "onnxruntime>=1.20"]
 EXTRAS = {
+    "onnx": ONNX,
+    "openvino": [*ONNX[:2], "openvino>=2024.6"],
     "sim": SIM,
     "test": TEST,
     "dev": [*TEST, *DASK, "ruff>=0.5", "mypy>=1.10", "types-PyYAML", "import-linter>=2.1"],

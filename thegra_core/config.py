@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from thegra_core.errors import ConfigError
 
-PROFILES = ("paper", "quality", "fast")
+PROFILES = ("paper", "quality", "fast", "realtime")
 RUN_FACTS = "run"
 """Key of a run's `config.yaml` that tells what it was run on; no parameter."""
 
@@ -195,6 +195,7 @@ class ExtractorConfig(Section):
     subpixel: bool = Field(True, description="superpoint: move keypoints from the whole pixel to the centre of mass of the 3x3 scores; measured: median epipolar error 9, 5 and 1 % less on three sequences; the paper's network gives whole pixels")
     long_side: int | None = Field(None, ge=128, description="px; images are scaled so that the long side has this length before detection; none: as they are")
     device: str = Field("auto", description="auto, cpu, cuda, cuda:0, ...")
+    backend: Literal["torch", "auto", "onnxruntime", "openvino"] = Field("torch", description="what computes the network of xfeat on a CPU; auto: the fastest that is installed; the others are always computed by torch")
 
 
 class MatcherConfig(Section):
@@ -206,6 +207,22 @@ class MatcherConfig(Section):
     width_confidence: float = Field(0.99, ge=-1, le=1, description="LightGlue's pruning; -1: off")
     ratio: float = Field(0.85, gt=0, le=1, description="nearest neighbour over second nearest; Lowe 2004 uses 0.8")
     device: str = Field("auto", description="auto, cpu, cuda, cuda:0, ...")
+
+
+class FlowConfig(Section):
+    """Following keypoints from frame to frame instead of detecting in each."""
+
+    enabled: bool = Field(False, description="detect on keyframes and where following fails, follow by Lucas-Kanade in between; off: detect in every frame, as in the paper")
+    window: int = Field(15, ge=5, le=61, description="px; side of the square that is followed (measured: 21 takes 1.3 times as long and keeps 2 to 4 % more points)")
+    levels: int = Field(4, ge=0, le=8, description="halvings of the image; 4 follow 80 px (measured)")
+    max_back_px: float = Field(1.0, gt=0, description="px by which a point followed there and back may miss where it came from")
+    patch: int = Field(15, ge=5, le=31, description="px; side of the square whose look is compared before and after")
+    min_similarity: float = Field(0.7, ge=-1, le=1, description="least zero-mean normalized cross-correlation of the squares")
+    border: int = Field(4, ge=0, le=64, description="px at the image's edge where nothing is followed")
+    min_points: int = Field(80, ge=8, description="points below which new ones are detected")
+    min_share: float = Field(0.4, ge=0, le=1, description="the same, as a share of the points after the last detection")
+    near_px: float = Field(4.0, gt=0, description="px around a followed point in which a detection is the same point")
+    min_shared: int = Field(50, ge=8, description="tracks that two frames must share for these to be their matches; learned matching where they share fewer")
 
 
 # ---- the method (paper Sec. III-C, III-D) -----------------------------------------------------------------------------------------
@@ -231,6 +248,7 @@ class InitializationConfig(Section):
 class TrackingConfig(Section):
     """Two-stage tracking."""
 
+    match_by: Literal["matcher", "nearest"] = Field("matcher", description="how frames are matched: by the configured matcher, or by nearest descriptors, which takes a fifteenth of LighterGlue's time (measured); mapping matches by the configured one")
     min_reference_matches: int = Field(15, ge=4, description="matches that see a landmark; ORB-SLAM3: 15")
     min_reference_inliers: int = Field(10, ge=4, description="ORB-SLAM3: 10")
     min_inliers: int = Field(25, ge=6, description="inliers after the second stage; ORB-SLAM3: 30, thermal frames have fewer points")
@@ -253,6 +271,7 @@ class KeyframeConfig(Section):
     rotation_deg: float = Field(15.0, gt=0, description="degrees since the last keyframe; paper: 15")
     translation_ratio: float = Field(0.03, gt=0, description="displacement over median depth; paper: 0.03")
     min_tracked_ratio: float = Field(0.5, ge=0, le=1, description="landmarks tracked over those of the reference keyframe; below it a keyframe is due; 0: off, as in the paper")
+    most_pending: int = Field(2, ge=1, description="keyframes that wait for mapping, where it runs in a process of its own; none is made while so many do")
 
 
 class MappingConfig(Section):
@@ -268,6 +287,10 @@ class MappingConfig(Section):
     max_scale_ratio: float = Field(4.0, gt=1, description="distance of a new point in one view over that in the other")
     min_found_ratio: float = Field(0.25, ge=0, le=1, description="found / predicted visible below which a landmark is culled; paper: 25 %")
     trial_keyframes: int = Field(3, ge=1, description="keyframes after which a landmark must have trial_observations; ORB-SLAM3: 3")
+    redundant_share: float = Field(0.9, gt=0, le=1, description="share of a keyframe's landmarks that redundant_observers others must see from about as near for it to leave; ORB-SLAM3: 0.9")
+    redundant_observers: int = Field(3, ge=2, description="ORB-SLAM3: 3")
+    redundant_from: int = Field(500, ge=2, description="keyframes of a map from which on redundant ones leave; from 20 on it spares 4 % of them on a corridor loop and costs 10 % of the accuracy (measured)")
+    max_keyframes: int = Field(3000, ge=10, description="keyframes of a map beyond which the most redundant ones leave in any case; about 1 MB each")
     trial_observations: int = Field(3, ge=2, description="observations a landmark must have by then; ORB-SLAM3: 3")
 
 
@@ -305,10 +328,15 @@ class LoopConfig(Section):
     group: int = Field(3, ge=1, description="keyframes of the old place that the new one is matched to: the candidate and its best neighbours")
     min_matches: int = Field(40, ge=6, description="matches to the candidate alone")
     min_inliers: int = Field(40, ge=6, description="landmarks of the old place that must agree with one pose of the new keyframe")
+    min_visible_share: float = Field(0.2, ge=0, le=1, description="these over the landmarks of the old place that should be seen from there; where a building only repeats itself 0.05 to 0.18 agree, in real loops 0.17 to 0.45 (measured)")
+    max_drift_deg: float = Field(20.0, gt=0, description="degrees by which a loop may turn the newest keyframe: corridors that look alike at another heading turn it by 90 (measured), real loops by 1 to 5")
+    max_drift_ratio: float = Field(0.2, gt=0, description="distance by which a loop may move the newest keyframe, over the way since the old place; real loops 0.04 at the most, look-alikes 0.8 and more (measured)")
     min_scale_pairs: int = Field(10, ge=3, description="landmarks of both places that are the same points: they tell the scale")
     max_scale_spread: float = Field(0.1, gt=0, description="median deviation of the logarithm of their depths' ratio")
     max_rotation_deg: float = Field(3.0, gt=0, description="degrees by which a second keyframe may place the loop otherwise")
     max_translation_ratio: float = Field(0.1, gt=0, description="the same in position, over the median depth")
+    rotations: tuple[Literal[90, 180, 270], ...] = Field((), description="degrees by which the image of a frame that is not found is turned, for cameras that look at the ground and turn between two frames; each costs an extraction and the matches of such a frame, until a new map may begin")
+    full_adjustment_after: int = Field(3, ge=1, description="keyframes after a loop or a merge from which on the result of the full adjustment is taken")
 
 
 class ThegraConfig(Section):
@@ -321,6 +349,7 @@ class ThegraConfig(Section):
     preprocessing: PreprocessingConfig = PreprocessingConfig()
     extractor: ExtractorConfig = ExtractorConfig()
     matcher: MatcherConfig = MatcherConfig()
+    flow: FlowConfig = FlowConfig()
     initialization: InitializationConfig = InitializationConfig()
     tracking: TrackingConfig = TrackingConfig()
     keyframe: KeyframeConfig = KeyframeConfig()

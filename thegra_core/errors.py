@@ -19,3 +19,7 @@ class ConfigError(ThegraError):
 
 class WeightsError(ThegraError):
     """A network's weights are missing or damaged."""
+
+
+class MappingError(ThegraError):
+    """The process of the mapping stage has ended with an error."""

@@ -1,10 +1,16 @@
-"""How this process uses the machine: threads and memory. Called once, where a process starts; nothing here changes a result."""
+"""How this process uses the machine: threads and memory. Called once, where a process starts; nothing here changes a result. What it has used, and how it gets work done elsewhere."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
 
 MOST_THREADS = 4
 """Of the networks by default; a keyframe's 1024 points do not fill more."""
@@ -20,12 +26,16 @@ def set_threads(count: int) -> None:
     A brief wait is near the better of the two in both cases (measured).
 
     Args:
-        count: 0: one a core, `MOST_THREADS` at most. `OMP_NUM_THREADS` wins over it.
+        count: 0: one a core, `MOST_THREADS` at most. `OMP_NUM_THREADS` wins over it. A count given is OpenCV's, too, which else takes all cores.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     os.environ.setdefault("OMP_NUM_THREADS", str(count or min(cores, MOST_THREADS)))
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+    if count:
+        import cv2
+
+        cv2.setNumThreads(count)
 
 
 def keep_freed_memory() -> None:
@@ -41,3 +51,28 @@ def keep_freed_memory() -> None:
         return
     mallopt(_M_MMAP_THRESHOLD, _LARGEST_BYTES)
     mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+
+
+Submit = Callable[..., "Future[Any]"]
+"""Has a function of a module called with the arguments given, now or elsewhere."""
+
+
+def call_now(function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    """Call it here; the future is done. What it raises is raised."""
+    future: Future[Any] = Future()
+    future.set_result(function(*arguments))
+    return future
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What a process has used so far: seconds of all cores, and the most memory at a time in MiB."""
+
+    cpu_s: float = 0.0
+    peak_rss_mb: float = 0.0
+
+
+def own_usage() -> Usage:
+    """Usage of this process, without its children."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return Usage(time.process_time(), peak / (1 << 20) if sys.platform == "darwin" else peak / 1024)

@@ -1,7 +1,8 @@
-"""The whole system: four stages wired in one thread, frame by frame, deterministic."""
+"""The whole system: four stages wired frame by frame; in one thread, deterministic, or with mapping beside it in a process of its own."""
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -13,18 +14,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
-from thegra_core.errors import InputError
-from thegra_core.features.protocols import Extractor, Matcher
-from thegra_core.features.registry import make_extractor, make_matcher
+from thegra_core.errors import MappingError
+from thegra_core.features.front_end import DetectAndFollow, DetectEach
+from thegra_core.features.nearest import Nearest
+from thegra_core.features.protocols import Extractor, FrontEnd, Matcher, Wanted
+from thegra_core.features.registry import make_extractor, make_frame_matcher
+from thegra_core.features.tracks import shared_tracks
+from thegra_core.features.turning import TurnableExtractor
 from thegra_core.geometry.camera import CameraModel
-from thegra_core.map.map import Map
+from thegra_core.map.map import Map, summarize
 from thegra_core.mapping.mapper import Mapper
+from thegra_core.mapping.process import MappingProcess
+from thegra_core.mapping.service import InlineMapping, MappingService
 from thegra_core.messages import (
     Features,
     Frame,
     FrameRecord,
     MapSummary,
     MapUpdate,
+    Matches,
+    Revisit,
     Run,
     Shutter,
     ShutterState,
@@ -32,13 +41,16 @@ from thegra_core.messages import (
     TrackingResult,
     TrackingState,
 )
+from thegra_core.optimization.solver import BundleSolver
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
+from thegra_core.process import Usage
 from thegra_core.snapshots import SnapshotKeeper
 from thegra_core.tracking.fixed_pattern import FixedPatternMask
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
 
 FloatArray = NDArray[np.float64]
+logger = logging.getLogger(__name__)
 _NO_POSE = (TrackingState.INITIALIZING, TrackingState.LOST, TrackingState.RELOCALIZING)
 BACKWARD_FRAMES = 3
 """Backward stamps in a row that are refused before time is believed to have been set back."""
@@ -73,34 +85,72 @@ class Slam:
     """Frames in, poses out; `finish` gives the account of the run.
 
     Args:
+        extractor, matcher: Instead of those configured.
         keep_records: Remember every frame for `finish`. A live stream has no end and needs only the last one.
+        beside: Map in a process of its own, with the matcher configured: `process` never waits for it, and what becomes of a run depends on the machine.
+        solver: Makes the full adjustments after loops and merges, see `Mapper`; beside, they are made in processes of their own.
 
     Raises:
         WeightsError: If the configured networks' weights are not there.
     """
 
     def __init__(
-        self, camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None, keep_records: bool = True
+        self,
+        camera: CameraModel,
+        config: ThegraConfig,
+        extractor: Extractor | None = None,
+        matcher: Matcher | None = None,
+        *,
+        keep_records: bool = True,
+        beside: bool = False,
+        solver: BundleSolver | None = None,
     ) -> None:
         self._camera = camera
         self._chain = Chain(config.preprocessing)
         self._shutter = ShutterDetector(config.preprocessing.shutter)
         self._fixed_pattern = FixedPatternMask()
         self._masks = config.tracking.mask_fixed_pattern
-        self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
-        self._matcher = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
-        self._tracking = TrackingStage(camera, config, self._matcher)
-        self._mapper = Mapper(camera, config, self._matcher)
+        self._rotations = config.loop.rotations
+        self._extractor = TurnableExtractor(extractor if extractor is not None else make_extractor(config.extractor))
+        nearest = Nearest(config.matcher) if config.tracking.match_by == "nearest" and matcher is None else None
+        self._matcher = make_frame_matcher(config, nearest or matcher)
+        self._front_end: FrontEnd = DetectEach(self._extractor)
+        if config.flow.enabled:
+            self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
+        self._mapping: MappingService = (
+            MappingProcess(camera, config, make_frame_matcher)
+            if beside
+            else InlineMapping(Mapper(camera, config, self._matcher if nearest is None else make_frame_matcher(config), solver))
+        )
+        self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit)
         self._frames: list[_Placed] = []
         self._keep_records = keep_records
         self._last_stamp_ns: int | None = None
         self._backward, self._backward_ns = 0, None  # type: int, int | None
         self._bad: Counter[str] = Counter()
+        self._revisits: list[Revisit] = []
         self._closures: list[tuple[int, int]] = []
         self._snapshots = SnapshotKeeper()
         self._view: Callable[[], Snapshot] | None = None
         self._stage_ms: dict[str, float] = {}
         self._first_keyframe_id = 0
+
+    def warm_up(self) -> None:
+        """Let everything that is made at its first use be made, and wait for the process of mapping: a live stream waits for nothing."""
+        width, height = self._camera.image_size
+        noise = np.random.default_rng(0).integers(0, 255, (height, width), np.uint8)
+        features = self._extractor.extract(self._chain(noise, 0), 0)
+        self._matcher.match(features, features)
+        self._chain.reset()
+        self._mapping.usage()
+
+    def usage(self) -> Usage:
+        """What processes beside this one have used."""
+        return self._mapping.usage()
+
+    def close(self) -> None:
+        """End what runs beside this process; nothing else can be called afterwards."""
+        self._mapping.close()
 
     def process(self, frame: Frame) -> TrackingResult:
         """One frame through all stages; never raises for what an image holds. Bad frames are counted and change nothing."""
@@ -120,6 +170,8 @@ class Slam:
             if shutter.recalibrated:
                 self._chain.reset()
                 self._fixed_pattern.forget()
+            if shutter.shutter is not Shutter.OPEN:
+                self._front_end.forget()
             if shutter.shutter is Shutter.JUST_OPENED:
                 self._tracking.reopen()
             output = self._tracking.hold(frame.stamp_ns, shutter.reason) if shutter.shutter is Shutter.CLOSED else self._see(frame)
@@ -143,7 +195,7 @@ class Slam:
         Raises:
             InputError: If the file is not there, not whole, or of another version, camera or extractor.
         """
-        update = self._mapper.load(path)
+        update = self._mapping.load(path)
         self._tracking.resume(update)
         self._first_keyframe_id = 1 + max(m.id for m in update.new_keyframes)
 
@@ -153,9 +205,7 @@ class Slam:
         Raises:
             InputError: If there is no map yet, or the file cannot be written.
         """
-        if not self._mapper.map_ids:
-            raise InputError(f"there is no map yet that could be written to {path}")
-        self._mapper.save(max(self._mapper.map_ids, key=lambda i: (len(self._mapper.map(i).keyframes), -i)), path)
+        self._mapping.save(path)
 
     def snapshot(self) -> Snapshot | None:
         """Image, keypoints and tracks of the last frame; None if it was bad or the shutter was closed."""
@@ -163,14 +213,12 @@ class Slam:
 
     def map_size(self) -> tuple[int, int]:
         """Keyframes and landmarks of the map being tracked."""
-        if self._tracking.map_id < 0:
-            return 0, 0
-        current = self._mapper.map(self._tracking.map_id)
-        return len(current.keyframes), len(current.landmarks)
+        current = self._tracking.map
+        return (len(current.keyframes), len(current.landmarks)) if current is not None else (0, 0)
 
     def current_map(self) -> MapSummary | None:
         """A copy of what the map being tracked holds; None before the first map."""
-        return self._mapper.summary(self._tracking.map_id) if self._tracking.map_id >= 0 else None
+        return summarize(self._tracking.map) if self._tracking.map is not None else None
 
     def finish(self, progress: Callable[[str], None] | None = None) -> Run:
         """Full bundle adjustment, late localisation of frames without a pose, and the account of the run."""
@@ -179,10 +227,7 @@ class Slam:
         if unproven is not None:
             self._drop(unproven)
         say("full bundle adjustment")
-        for map_id in self._mapper.map_ids if not self.localization_only else ():
-            update = self._mapper.finish(map_id)
-            if map_id == self._tracking.map_id:
-                self._tracking.apply(update)
+        maps, (loops, merges) = self._finished_maps()
         say("placing frames that had no pose")
         late = {p.stamp_ns: p for p in self._tracking.localize_afterwards()}
         for row, placed in enumerate(self._frames):
@@ -191,18 +236,18 @@ class Slam:
                 self._frames[row] = replace(
                     placed, map_id=found.map_id, reference_id=found.reference_id, reference_from_camera=found.reference_from_camera, afterwards=True
                 )
-        maps = {map_id: self._mapper.map(map_id) for map_id in self._mapper.map_ids}
         by_stamp = {(map_id, k.stamp_ns): k.id for map_id, m in maps.items() for k in m.keyframes.values() if k.id >= self._first_keyframe_id}
         records = tuple(self._final(placed, maps, by_stamp) for placed in self._frames)
         counts = Counter(r.map_id for r in records if r.world_from_camera is not None)
         return Run(
             frames=records,
-            maps=tuple(self._mapper.summary(i) for i in self._mapper.map_ids),
+            maps=tuple(summarize(current) for current in maps.values()),
             main_map_id=max(counts, key=lambda i: (counts[i], -i)) if counts else -1,
             shutter_closures_ns=tuple(self._closures),
             losses=self._tracking.losses,
-            loops=self._mapper.loops,
-            merges=self._mapper.merges,
+            loops=loops,
+            merges=merges,
+            revisits=tuple(self._revisits),
             relocalizations=self._tracking.relocalizations,
             bad_frames=dict(self._bad),
             snapshots=self._snapshots.kept(),
@@ -213,28 +258,72 @@ class Slam:
     def _see(self, frame: Frame) -> TrackingOutput:
         with self._timed("preprocessing"):
             image = self._chain(frame.image, frame.stamp_ns)
-        with self._timed("extraction"):
-            features = self._extractor.extract(image, frame.stamp_ns)
-            features = self._fixed_pattern.apply(features)
         reference = self._tracking.reference_features
-        with self._timed("matching"):
-            matches = self._matcher.match(features, reference) if reference is not None else None
-            if reference is not None and matches is not None and self._masks:
-                matches = self._fixed_pattern.learn(features, reference, matches)
-        with self._timed("tracking"):
-            output = self._tracking.process(features, matches)
+        features, output = self._front(image, frame.stamp_ns, reference)
         if output.dropped_map_id is not None:
             self._drop(output.dropped_map_id)
         with self._timed("mapping"):
             if output.initial_map is not None:
-                self._tracking.apply(self._mapper.initialize(output.initial_map))
+                self._mapping.initialize(output.initial_map)
             elif output.keyframe is not None:
-                update = self._mapper.insert(output.keyframe)
-                self._tracking.apply(update)
-                self._follow(update)
+                self._mapping.insert(output.keyframe)
+            self._take_updates()
         self._view = lambda: _snapshot(frame, image, features, output, reference)
         self._snapshots.offer(frame.index, self._view)
         return output
+
+    def _otherwise(self, image: NDArray[np.uint8], stamp_ns: int) -> Iterator[Features]:
+        """The features of the other orientations, each found when it is asked for."""
+        for degrees in self._rotations:
+            yield self._fixed_pattern.apply(self._extractor.turned(image, stamp_ns, degrees // 90))
+
+    def _front(self, image: NDArray[np.uint8], stamp_ns: int, reference: Features | None) -> tuple[Features, TrackingOutput]:
+        """Features of the image and what tracking made of them: of those followed, if there are any and they suffice, else of what is detected."""
+        with self._timed("flow"):
+            followed = self._front_end.follow(image, stamp_ns)
+        wanted = Wanted.MORE
+        if followed is not None:
+            features = self._fixed_pattern.apply(followed)
+            with self._timed("matching"):
+                matches = self._unmasked(features, reference, shared_tracks(features, reference)) if reference is not None else None
+            with self._timed("tracking"):
+                output = self._tracking.process_followed(features, matches)
+            if isinstance(output, TrackingOutput):
+                return features, output
+            wanted = output
+        with self._timed("extraction"):
+            features = self._fixed_pattern.apply(self._front_end.detect(wanted))
+        with self._timed("matching"):
+            matches = self._unmasked(features, reference, self._matcher.match(features, reference)) if reference is not None else None
+        with self._timed("tracking"):
+            output = self._tracking.process(features, matches, self._otherwise(image, stamp_ns))
+        if output.found_turned is not None:
+            features = output.found_turned
+            self._extractor.turns = features.turns
+            self._front_end.forget()
+        return features, output
+
+    def _unmasked(self, features: Features, reference: Features, matches: Matches) -> Matches:
+        return self._fixed_pattern.learn(features, reference, matches) if self._masks else matches
+
+    def _finished_maps(self) -> tuple[dict[int, Map], tuple[int, int]]:
+        """Maps by id, and how many loops and merges there were; what tracking knows of its map where mapping has failed."""
+        try:
+            for update in self._mapping.finish() if not self.localization_only else ():
+                self._take(update)
+            return {current.map_id: current for current in self._mapping.maps()}, self._mapping.counts()
+        except MappingError as error:
+            logger.warning("the map is left as tracking knows it: %s", error)
+            known = self._tracking.map
+            return ({known.map_id: known} if known is not None and known.keyframes else {}), (0, 0)
+
+    def _take_updates(self) -> None:
+        for update in self._mapping.updates():
+            self._take(update)
+
+    def _take(self, update: MapUpdate) -> None:
+        self._tracking.apply(update)
+        self._follow(update)
 
     def _trouble(self, frame: Frame) -> str:
         """What is wrong with a frame, or an empty string."""
@@ -271,13 +360,14 @@ class Slam:
         if placed.state is not TrackingState.TRACKING or placed.world_from_camera is None:
             self._frames.append(_Placed(result, index, bad=bad))
             return
-        map_id = placed.map_id if placed.map_id in self._mapper.map_ids else self._tracking.map_id  # its map may just have become part of another
-        reference = self._mapper.map(map_id).keyframes[placed.reference_id]
-        relative = np.eye(4) if placed.is_keyframe else reference.camera_from_world @ placed.world_from_camera
-        self._frames.append(_Placed(result, index, map_id, placed.reference_id, relative, afterwards=provisional is not None))
+        reference_id, relative = self._tracking.relative_to_reference(placed)
+        self._frames.append(_Placed(result, index, self._tracking.map_id, reference_id, relative, afterwards=provisional is not None))
 
     def _follow(self, update: MapUpdate) -> None:
-        """Frames keep their place beside their keyframe when a loop changes the scale there, or their map becomes part of another."""
+        """Frames keep their place when their keyframe leaves the map, when a loop changes the scale there, or their map becomes part of another."""
+        self._revisits.extend(update.revisits)
+        if update.removed_keyframes:
+            self._inherit(update)
         absorbed = update.absorbed
         if not update.scales and absorbed is None:
             return
@@ -289,17 +379,31 @@ class Slam:
             elif placed.map_id == update.map_id:
                 self._frames[row] = placed.scaled(update.scales.get(placed.reference_id, 1.0), update.map_id)
 
+    def _inherit(self, update: MapUpdate) -> None:
+        removed = {r.id: r for r in update.removed_keyframes}
+        by_stamp = {r.stamp_ns: r for r in removed.values() if r.id >= self._first_keyframe_id}
+        map_id = update.map_id if update.absorbed is None else update.absorbed.map_id
+        for row, placed in enumerate(self._frames):
+            gone = removed.get(placed.reference_id)
+            if placed.reference_from_camera is not None and gone is not None:
+                self._frames[row] = replace(placed, reference_id=gone.heir_id, reference_from_camera=gone.heir_from_removed @ placed.reference_from_camera)
+            elif placed.may_be_placed and placed.result.stamp_ns in by_stamp:  # a frame of before the first map, which was this keyframe
+                gone = by_stamp[placed.result.stamp_ns]
+                self._frames[row] = replace(placed, map_id=map_id, reference_id=gone.heir_id, reference_from_camera=gone.heir_from_removed, afterwards=True)
+
     def _drop(self, map_id: int) -> None:
         """Forget a map and the places of frames in it."""
-        self._mapper.drop(map_id)
+        self._mapping.drop(map_id)
         self._frames = [_Placed(p.result, p.index, bad=p.bad) if p.map_id == map_id else p for p in self._frames]
 
     @staticmethod
     def _final(placed: _Placed, maps: dict[int, Map], keyframe_by_stamp: dict[tuple[int, int], int]) -> FrameRecord:
-        """A frame carried by the final map; frames that became keyframes of a first map after their time have that keyframe's pose."""
-        if placed.reference_from_camera is not None:
-            pose = maps[placed.map_id].keyframes[placed.reference_id].world_from_camera @ placed.reference_from_camera
-            return FrameRecord(placed.index, placed.result, pose, placed.map_id, placed.afterwards)
+        """A frame carried by the final map; frames that are keyframes, also of a first map after their time, have that keyframe's pose."""
+        known = maps[placed.map_id].keyframes if placed.map_id in maps else {}
+        itself = keyframe_by_stamp.get((placed.map_id, placed.result.stamp_ns))
+        if placed.reference_from_camera is not None and (itself is not None or placed.reference_id in known):
+            beside = known[placed.reference_id].world_from_camera @ placed.reference_from_camera if itself is None else known[itself].world_from_camera
+            return FrameRecord(placed.index, placed.result, beside, placed.map_id, placed.afterwards)
         if placed.may_be_placed:
             for map_id, current in maps.items():
                 keyframe_id = keyframe_by_stamp.get((map_id, placed.result.stamp_ns))

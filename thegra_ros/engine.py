@@ -111,10 +111,11 @@ class Engine(Protocol):
 
 
 class LocalEngine:
-    """The system in the calling thread."""
+    """The system in the calling thread; `beside`: but for mapping, which then has a process of its own."""
 
-    def __init__(self, config: ThegraConfig) -> None:
+    def __init__(self, config: ThegraConfig, beside: bool = False) -> None:
         self._config = config
+        self._beside = beside
         self._networks: tuple[Extractor, Matcher] | None = None
         self._slam: Slam | None = None
         self._epoch = -1
@@ -132,7 +133,7 @@ class LocalEngine:
             view = slam.snapshot() if job.wants_view else None
             return Done(result, view, slam.current_map() if job.wants_map else None)
         except Exception as error:
-            self._slam = None
+            self.stop()
             raise EngineError(traceback.format_exc()) from error
 
     def obey(self, order: Order) -> str:
@@ -141,11 +142,13 @@ class LocalEngine:
         except ThegraError:
             raise
         except Exception as error:
-            self._slam = None
+            self.stop()
             raise EngineError(traceback.format_exc()) from error
 
     def stop(self) -> None:
-        pass
+        if self._slam is not None:
+            self._slam.close()
+        self._slam = None
 
     def _save(self, path: Path) -> str:
         if self._slam is None:
@@ -154,25 +157,33 @@ class LocalEngine:
         return f"the map is in {path}"
 
     def _begin_in(self, order: BeginIn) -> str:
-        self._epoch = order.epoch
-        self._slam = self._new(order.camera, order.path)
+        self._replace(self._new(order.camera, order.path), order.epoch)
         return f"the camera is sought in the map of {order.path}"
 
     def _slam_for(self, job: Job) -> Slam:
         if self._slam is None or job.epoch != self._epoch:
-            self._slam, self._epoch = self._new(job.camera, job.home), job.epoch
+            self._replace(self._new(job.camera, job.home), job.epoch)
         self._slam.localization_only = job.localization_only
         return self._slam
 
     def _new(self, camera: CameraModel, home: Path | None) -> Slam:
+        from thegra_core.optimization.solver import ProcessSolver
         from thegra_core.slam import Slam
 
         if self._networks is None:
             self.start()
-        made = Slam(camera, self._config, *(self._networks or ()), keep_records=False)
-        if home is not None:
-            made.load_map(home)
+        made = Slam(camera, self._config, *(self._networks or ()), keep_records=False, beside=self._beside, solver=ProcessSolver())
+        try:
+            if home is not None:
+                made.load_map(home)
+        except BaseException:
+            made.close()
+            raise
         return made
+
+    def _replace(self, made: Slam, epoch: int) -> None:
+        self.stop()
+        self._slam, self._epoch = made, epoch
 
 
 class ProcessEngine:
@@ -246,7 +257,7 @@ def serve(connection: Connection, config: ThegraConfig, slot: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to the whole group; the node tells when to end
     logging.basicConfig(level=logging.INFO, format="[thegra engine] %(levelname)s %(message)s")
     keep_freed_memory()
-    engine = LocalEngine(config)
+    engine = LocalEngine(config, beside=True)
     begin = time.perf_counter()
     try:
         engine.start()
@@ -255,6 +266,13 @@ def serve(connection: Connection, config: ThegraConfig, slot: Any) -> None:
         return
     connection.send("ready")
     _log.info("networks loaded in %.1f s", time.perf_counter() - begin)
+    try:
+        _answer(connection, engine, slot)
+    finally:
+        engine.stop()
+
+
+def _answer(connection: Connection, engine: LocalEngine, slot: Any) -> None:
     while True:
         try:
             asked = connection.recv()

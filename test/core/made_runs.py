@@ -13,6 +13,7 @@ import numpy as np
 from thegra_core.geometry.camera import CameraModel, DistortionModel
 from thegra_core.geometry.poses import so3_exp
 from thegra_core.messages import Frame, FrameRecord, MapSummary, Run, Snapshot, TrackingResult, TrackingState
+from thegra_core.process import Usage
 
 PERIOD_NS = 100_000_000
 BEGIN_NS = 1_700_000_000_000_000_000
@@ -104,6 +105,16 @@ class FakeSystem:
     def __init__(self, run: Run) -> None:
         self._run = run
         self.processed = 0
+        self.warm = self.closed = False
+
+    def warm_up(self) -> None:
+        self.warm = True
+
+    def usage(self) -> Usage:
+        return Usage()
+
+    def close(self) -> None:
+        self.closed = True
 
     def process(self, frame: Frame) -> TrackingResult:
         self.processed += 1

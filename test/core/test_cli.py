@@ -24,7 +24,7 @@ from thegra_core.errors import InputError
 from thegra_core.messages import Run, TrackingResult, TrackingState
 from thegra_core.outputs.trajectory import format_tum, make_trajectory, read_tum
 
-COMMANDS = ["run", "info", "score", "evaluate", "ablation", "config", "doctor", "benchmark slam", "weights list", "weights fetch", "weights verify"]
+COMMANDS = ["run", "info", "score", "evaluate", "ablation", "config", "doctor", "benchmark slam", "benchmark realtime", "weights list", "weights fetch", "weights verify"]
 
 
 def invoke(*arguments: str | Path):
@@ -39,6 +39,7 @@ def play(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         source = recording or FakeRecording(tmp_path, count=len(run.frames))
         monkeypatch.setattr(run_module, "open_recording", lambda path, topic, shutter_topic: source)
         monkeypatch.setattr(run_module, "make_system", lambda camera, config: system or FakeSystem(run))
+        monkeypatch.setattr(run_module, "make_live_system", lambda camera, config: system or FakeSystem(run))
         out = tmp_path / "out"
         return invoke("run", tmp_path, "--out", out, *options), out
 
@@ -390,3 +391,32 @@ def _leaves(values: dict, prefix: str = ""):
             yield from _leaves(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}"
+
+
+# ---- at the recording's own rate --------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_plays_at_its_own_rate(play, tmp_path: Path) -> None:
+    run = make_run()
+    system = FakeSystem(run)
+    result, out = play(run, "--realtime", system=system)
+    assert result.exit_code == 0, result.output
+    assert system.warm and system.closed
+    metrics = json.loads((out / "metrics.json").read_text())
+    given = system.processed
+    assert metrics["dropped_frames"] + given == len(run.frames) == metrics["frames_total"]
+    assert metrics["wall_s"] > 0.9 * (len(run.frames) - 1) * PERIOD_NS / 1e9
+    assert metrics["latency_ms"]["p50"] is not None and metrics["cpu_s_per_frame"] > 0
+
+
+def test_without_haste_nothing_is_dropped_and_nothing_is_late(play) -> None:
+    system = FakeSystem(make_run())
+    result, out = play(make_run(), system=system)
+    assert result.exit_code == 0 and system.closed and not system.warm
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["dropped_frames"] == 0 and metrics["latency_ms"] == {"p50": None, "p95": None, "p99": None}
+
+
+def test_networks_from_a_cache_are_no_real_time(tmp_path: Path) -> None:
+    result = invoke("run", tmp_path, "--realtime", "--cache", tmp_path / "cache")
+    assert result.exit_code == 2 and "leave --cache out" in result.output

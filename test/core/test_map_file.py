@@ -20,6 +20,7 @@ from synthetic import CAMERA, FakeExtractor, FakeMatcher, loop, room, stamp
 from test_slam import CONFIG, ate, frames, make, picture, play
 
 from thegra_core.errors import InputError
+from thegra_core.features.front_end import DetectEach
 from thegra_core.map import archive
 from thegra_core.map.archive import read_archive, write_archive
 from thegra_core.mapping.mapper import Mapper
@@ -195,8 +196,8 @@ def test_a_run_goes_on_in_a_kept_map(kept: Path) -> None:
 
 def test_poses_are_in_the_world_of_the_kept_map(kept: Path) -> None:
     slam, stream = resumed(kept, PATH[35:45])
-    before = {k.stamp_ns: k.world_from_camera.copy() for k in slam._mapper.map(0).keyframes.values()}
-    depth = slam._mapper.map(0).median_depth(max(slam._mapper.map(0).keyframes))
+    before = {k.stamp_ns: k.world_from_camera.copy() for k in slam._mapping.maps()[0].keyframes.values()}
+    depth = slam._mapping.maps()[0].median_depth(max(slam._mapping.maps()[0].keyframes))
     for offset, frame in enumerate(stream):
         found = slam.process(frame).world_from_camera
         wanted = before.get(stamp(35 + offset))
@@ -218,7 +219,7 @@ def test_localization_only_leaves_the_map_alone(kept: Path, tmp_path: Path) -> N
 def test_a_place_outside_the_map_is_not_claimed(kept: Path) -> None:
     """Localising only, a camera in another world stays without a pose, and no map is begun."""
     slam, stream = resumed(kept, PATH[:10])
-    slam._extractor = FakeExtractor(room(seed=5), {f.stamp_ns: pose for f, pose in zip(stream, PATH, strict=False)})
+    slam._front_end = DetectEach(FakeExtractor(room(seed=5), {f.stamp_ns: pose for f, pose in zip(stream, PATH, strict=False)}))
     slam.localization_only = True
     results = [slam.process(frame) for frame in stream]
     assert {r.state for r in results} <= {TrackingState.RELOCALIZING, TrackingState.LOST}

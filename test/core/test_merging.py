@@ -49,7 +49,7 @@ def test_live_poses_of_the_lost_map_are_not_mixed_with_the_others(merged) -> Non
 
 def test_tracking_and_mapping_agree_after_a_merge(merged) -> None:
     slam = merged[2]
-    replica, owner = slam._tracking._place.map, slam._mapper.map(0)
+    replica, owner = slam._tracking._place.map, slam._mapping.maps()[0]
     assert replica.keyframes.keys() == owner.keyframes.keys()
     for i, keyframe in owner.keyframes.items():
         np.testing.assert_array_equal(replica.keyframes[i].world_from_camera, keyframe.world_from_camera)

@@ -32,7 +32,7 @@ def slam(
     suite: Annotated[bool, typer.Option("--suite", help="Also the fixed simulated suite; what is missing of it is made first.")] = False,
     suite_dir: Annotated[Path, typer.Option(metavar="DIR", help="Where the suite is kept.")] = Path("runs/suite"),
     only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Of the suite only this sequence; repeatable.")] = None,
-    profile: Annotated[list[str] | None, typer.Option(help="paper, quality or fast; repeatable. Default: quality; with --suite all.")] = None,
+    profile: Annotated[list[str] | None, typer.Option(help="paper, quality, fast or realtime; repeatable. Default: quality; with --suite all.")] = None,
     runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
     cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there; their time is then missing from s/frame.")] = None,
     max_frames: Annotated[list[str] | None, typer.Option("--max-frames", metavar="NAME=N", help="Use the first N frames of the recording of that name; repeatable.")] = None,
@@ -86,6 +86,42 @@ def slam(
         raise typer.Exit(SOME_FAILED)
 
 
+@app.command("realtime")
+def realtime(
+    recordings: Annotated[list[Path] | None, typer.Argument(metavar="[DIR...]", help="Recordings as `thegra run` takes them. Default: a simulated room, in every --size at every --rate.")] = None,
+    profile: Annotated[list[str] | None, typer.Option(help="paper, quality, fast or realtime; repeatable. Default: all.")] = None,
+    size: Annotated[list[str] | None, typer.Option(metavar="WxH", help="Of the simulated images; repeatable. Default: 320x256 and 640x512.")] = None,
+    rate: Annotated[list[float] | None, typer.Option(metavar="HZ", min=0.1, help="Of the simulated images; repeatable. Default: 10, 20 and 30.")] = None,
+    duration: Annotated[float, typer.Option(metavar="S", min=1.0, help="Of the simulated recordings.")] = 20.0,
+    recordings_dir: Annotated[Path, typer.Option(metavar="DIR", help="Where the simulated recordings are kept.")] = Path("runs/realtime"),
+    offline: Annotated[bool, typer.Option("--offline/--no-offline", help="Also run each without haste, for the accuracy that haste may cost.")] = True,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the tables and every run's results. Default: runs/benchmark_TIME.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter for all runs; repeatable. `thegra config` lists them.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print results.json instead of the table.")] = False,
+) -> None:
+    """Play recordings at their own rate and tell latency, dropped frames and CPU time a frame, with the accuracy live and offline.
+
+    Example: `thegra benchmark realtime --profile realtime --size 640x512 --rate 20`
+
+    Writes results.json and results.md. Nothing else should use the machine meanwhile. Exit code: 0 all ran, 1 some run failed, 2 wrong use.
+    """
+    from rich.console import Console
+
+    from thegra_core.cli.simulate import image_size
+    from thegra_core.evaluation.benchmark import realtime as logic
+
+    target = out or Path("runs") / f"benchmark_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"
+    with Console(stderr=True).status("starting") as status:
+        sizes = [image_size(text) for text in size or ("320x256", "640x512")]
+        played = recordings or logic.simulated(recordings_dir, sizes, rate or (10.0, 20.0, 30.0), duration, lambda n, done, total: status.update(f"simulating {n}: {done} of {total} frames"))
+        content = logic.benchmark(played, tuple(dict.fromkeys(profile or PROFILES)), target, offline, tuple(set_ or ()), status.update)
+    print(json.dumps(content, indent=2, allow_nan=False) if as_json else logic.markdown(content))
+    for failure in logic.failures(content):
+        typer.echo(f"failed: {failure}", err=True)
+    if logic.failures(content):
+        raise typer.Exit(SOME_FAILED)
+
+
 @app.command("preprocessing")
 def preprocessing(
     recordings: Annotated[list[Path] | None, typer.Argument(metavar="[INPUT...]", help="Recordings to take frames from. Default: a simulated 640x512 scene.")] = None,
@@ -118,6 +154,46 @@ def preprocessing(
         table.add_row(name, f"{figures['ms']:.2f}", f"{reference:.2f}" if reference else "–", f"{reference / figures['ms']:.1f}" if reference else "–")
     Console().print(table)
     print(f"the paper's chain: {content['chain']['within_one_level_pct']:.3f} % of the pixels within one grey level of the reference")
+
+
+@app.command("growth")
+def growth(
+    minutes: Annotated[float, typer.Option(min=0.1, metavar="MIN", help="Length of the walk.")] = 10.0,
+    keypoints: Annotated[int, typer.Option(min=100, metavar="N", help="Keypoints of a frame, about.")] = 300,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for growth.json and growth.png. Default: runs/growth_TIME.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter; repeatable. `thegra config` lists them.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Time tracking and mapping while the map grows: a walk through new places, made of points instead of images.
+
+    Example: `thegra benchmark growth --minutes 10 --out runs/growth`
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from thegra_core.config import load_config
+    from thegra_core.evaluation.benchmark import growth as logic
+
+    config = load_config("quality", overrides={"preprocessing.filters": "[]"} | dict(_assignment(text) for text in set_ or ()))
+    folder = out or Path("runs") / f"growth_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("walking", total=None)
+        samples = logic.walk(config, minutes, keypoints, lambda done, total: bar.update(task, completed=done, total=total))
+    logic.write(samples, folder)
+    told = logic.summary(samples)
+    if as_json:
+        print(json.dumps(told, indent=2))
+        return
+    for name, value in told.items():
+        print(f"{name:18} {value}")
+    print(f"figure             {folder / 'growth.png'}")
+
+
+def _assignment(text: str) -> tuple[str, str]:
+    key, separator, value = text.partition("=")
+    if not separator:
+        raise ConfigError(f"--set {text}: write KEY=VALUE")
+    return key, value
 
 
 def _frames_of(recordings: Sequence[Path], count: int) -> list[ImageArray]:

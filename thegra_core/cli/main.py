@@ -92,7 +92,7 @@ def run(
     topic: Annotated[str | None, typer.Option(help="Image topic; guessed when only one fits.")] = None,
     shutter_topic: Annotated[str | None, typer.Option(help="Topic of a bag with the camera's own shutter state: a boolean (true: closed) or FLIR's FFC state (2: in progress).")] = None,
     camera: Annotated[str | None, typer.Option(metavar="FILE", help="Camera calibration: ROS, Kalibr or OpenCV yaml, or fx,fy,cx,cy. Default: the recording's own.")] = None,
-    profile: Annotated[str | None, typer.Option(help="paper, quality or fast. Default: quality.")] = None,
+    profile: Annotated[str | None, typer.Option(help="paper, quality, fast or realtime. Default: quality.")] = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with parameters; a run's config.yaml will do.")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter, e.g. extractor.max_keypoints=2048; repeatable. `thegra config` lists them.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the results. Default: runs/INPUT_TIME.")] = None,
@@ -104,6 +104,7 @@ def run(
     map_: Annotated[Path | None, typer.Option("--map", metavar="FILE", help="Begin in the map of this file and go on in it.")] = None,
     localization_only: Annotated[bool, typer.Option("--localization-only", help="With --map: find the camera in the map and leave the map as it is.")] = False,
     save_map: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the map to this file at the end, for --map.")] = None,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Play the recording at its own rate, as a camera would: what comes too fast is dropped, and mapping has a process of its own. The outcome then depends on the machine.")] = False,
     viewer: Annotated[str, typer.Option(help="none, or rerun to watch live.")] = "none",
     cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there: runs that differ only in seed or back end are then much faster.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors and one final line only.")] = False,
@@ -119,9 +120,26 @@ def run(
     options = RunOptions(
         recording=recording, topic=topic, shutter_topic=shutter_topic, camera=camera, profile=profile, config=config, assignments=tuple(set_ or ()), out=out,
         groundtruth=groundtruth, max_frames=max_frames, start_s=start, duration_s=duration, seed=seed, viewer=viewer, quiet=quiet, cache=cache,
-        map=map_, localization_only=localization_only, save_map=save_map,
+        map=map_, localization_only=localization_only, save_map=save_map, realtime=realtime,
     )  # fmt: skip
     raise typer.Exit(run_recording(options))
+
+
+@app.command("export-models")
+def export_models(
+    size: Annotated[list[str] | None, typer.Option(metavar="WxH", help="Image size; repeatable. Default: 640x512 and 320x256.")] = None,
+) -> None:
+    """Write XFeat's network as ONNX files where the backends onnxruntime and openvino look for them.
+
+    Example: `thegra export-models --size 640x512`
+
+    Without this command it is done at the first run with such a backend, which then takes some seconds longer. It needs `pip install onnx onnxscript`.
+    """
+    from thegra_core.cli.simulate import image_size
+    from thegra_core.features.xfeat import export_xfeat
+
+    for text in size or ("640x512", "320x256"):
+        typer.echo(export_xfeat(image_size(text)))
 
 
 @app.command()
@@ -167,7 +185,7 @@ def evaluate(
     folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Where the data set lies; `generic`: YAML lists of recordings.")],
     dataset: Annotated[str, typer.Option(help="vivid, rovtio, tum, euroc, kitti or generic.")],
     runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
-    profile: Annotated[list[str] | None, typer.Option(help="paper, quality or fast; repeatable. Default: quality.")] = None,
+    profile: Annotated[list[str] | None, typer.Option(help="paper, quality, fast or realtime; repeatable. Default: quality.")] = None,
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time on this machine.")] = 1,
     dask: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler, which must see the same files.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for tables and runs; with the folder of an evaluation, only what is missing is run. Default: runs/evaluate_DATASET.")] = None,
@@ -205,7 +223,7 @@ def ablation(
     inputs: Annotated[list[Path], typer.Argument(metavar="INPUT...", help="Recordings as `thegra run` takes them, with groundtruth.txt beside; with --dataset its folders.")],
     dataset: Annotated[str | None, typer.Option(help="Take the sequences of this data set, as `thegra evaluate` does.")] = None,
     choice: Annotated[list[Choice] | None, typer.Option(help="weighting or chain; repeatable. Default: both.")] = None,
-    profile: Annotated[str, typer.Option(help="paper, quality or fast: what the choices are made in.")] = "quality",
+    profile: Annotated[str, typer.Option(help="paper, quality, fast or realtime: what the choices are made in.")] = "quality",
     runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
     workers: Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time on this machine.")] = 1,
     dask: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of this Dask scheduler, which must see the same files.")] = None,
@@ -233,7 +251,7 @@ def ablation(
 
 @app.command()
 def config(
-    profile: Annotated[str | None, typer.Option(help="paper, quality or fast. Default: quality.")] = None,
+    profile: Annotated[str | None, typer.Option(help="paper, quality, fast or realtime. Default: quality.")] = None,
     as_yaml: Annotated[bool, typer.Option("--yaml", help="Print YAML that --config reads.")] = False,
 ) -> None:
     """List every parameter with value, range, unit and source.

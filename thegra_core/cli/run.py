@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -25,8 +25,9 @@ from thegra_core.outputs.metrics import Timing
 from thegra_core.outputs.trajectory import NS_PER_S, read_tum
 from thegra_core.outputs.viewer import Viewer, make_viewer
 from thegra_core.outputs.write import RecordingFacts, write_run
-from thegra_core.process import set_threads
+from thegra_core.process import Usage, set_threads
 from thegra_core.sources.open import camera_for, open_recording
+from thegra_core.sources.playback import Playback
 from thegra_core.sources.recording import Recording
 from thegra_core.version import VERSION
 
@@ -60,6 +61,7 @@ class RunOptions:
     map: Path | None = None
     localization_only: bool = False
     save_map: Path | None = None
+    realtime: bool = False
 
 
 class System(Protocol):
@@ -67,6 +69,7 @@ class System(Protocol):
 
     localization_only: bool
 
+    def warm_up(self) -> None: ...
     def process(self, frame: Frame) -> TrackingResult: ...
     def snapshot(self) -> Snapshot | None: ...
     def current_map(self) -> MapSummary | None: ...
@@ -74,6 +77,8 @@ class System(Protocol):
     def load_map(self, path: Path) -> None: ...
     def save_map(self, path: Path) -> None: ...
     def finish(self, progress: Callable[[str], None] | None = None) -> Run: ...
+    def usage(self) -> Usage: ...
+    def close(self) -> None: ...
 
 
 @dataclass
@@ -85,6 +90,9 @@ class _Done:
     error: ThegraError | None = None
     reason: str = ""
     unreadable: dict[str, int] = field(default_factory=dict)
+    dropped: int = 0
+    latency_ms: list[float] = field(default_factory=list)
+    cpu_s: float = 0.0
 
 
 def run_recording(options: RunOptions) -> int:
@@ -97,7 +105,7 @@ def run_recording(options: RunOptions) -> int:
         ThegraError: If the input or an option cannot be used; what was processed until then is written.
     """
     started = datetime.now(timezone.utc)
-    _check_map_options(options)
+    _check_options(options)
     config = load_config(options.profile, options.config, _overrides(options))
     recording = open_recording(options.recording, options.topic, options.shutter_topic)
     camera = camera_for(recording, options.camera)
@@ -108,27 +116,39 @@ def run_recording(options: RunOptions) -> int:
         for line in (f"thegra {VERSION}, profile {config.profile}, seed {config.seed}", f"input {recording.path}", f"arguments {shlex.join(sys.argv[1:])}", *recording.notes):
             _log.info("%s", line)
         front_end = _cached_front_end(config, options.cache)
-        system = make_system(camera, config, *front_end)
-        if options.map is not None:
-            progress.stage("reading the map")
-            system.load_map(options.map)
-            system.localization_only = options.localization_only
-        done, wall_s = _process(system, _window(recording, options), recording, progress, viewer, interrupted)
-        if done.frames == 0 and done.interrupted:
-            raise KeyboardInterrupt
-        if done.frames == 0:
-            raise done.error or InputError(_no_frames(options, done))
-        begin = time.perf_counter()
-        run = system.finish(progress.stage)
-        timing = Timing(wall_s=wall_s, frames_read=done.frames, finish_s=time.perf_counter() - begin, cached_pct=_cached_pct(front_end))
+        system = make_live_system(camera, config) if options.realtime else make_system(camera, config, *front_end)
+        with closing(system):
+            if options.map is not None:
+                progress.stage("reading the map")
+                system.load_map(options.map)
+                system.localization_only = options.localization_only
+            frames = _window(recording, options)
+            if options.realtime:
+                progress.stage("warming up")
+                system.warm_up()
+                done, wall_s = _play(system, frames, recording, progress, viewer, interrupted)
+            else:
+                done, wall_s = _process(system, frames, recording, progress, viewer, interrupted)
+            if done.frames == 0 and done.interrupted:
+                raise KeyboardInterrupt
+            if done.frames == 0:
+                raise done.error or InputError(_no_frames(options, done))
+            begin = time.perf_counter()
+            run = system.finish(progress.stage)
+            finish_s = time.perf_counter() - begin
+            if options.save_map is not None and run.maps:
+                system.save_map(options.save_map)
+            apart = system.usage()
+        timing = Timing(
+            wall_s=wall_s, frames_read=done.frames, finish_s=finish_s, dropped_frames=done.dropped, cached_pct=_cached_pct(front_end),
+            latency_ms=done.latency_ms, cpu_s=done.cpu_s, apart_rss_mb=apart.peak_rss_mb,
+        )  # fmt: skip
         viewer.finish(run)
         facts = RecordingFacts(
             name=recording.name, path=recording.path, topic=recording.topic, camera=camera, weights=_weights(config), problems=done.unreadable,
             notes=tuple(recording.notes), command=shlex.join(["thegra", *sys.argv[1:]]), started_utc=f"{started:%Y-%m-%dT%H:%M:%SZ}",
         )  # fmt: skip
         progress.stage("writing the results")
-        if options.save_map is not None and run.maps:
-            system.save_map(options.save_map)
         written = write_run(run, out, config, facts, groundtruth, timing)
         _log.info("%s", headline(written.metrics))
         done.interrupted = done.interrupted or interrupted()
@@ -148,6 +168,14 @@ def make_system(camera: CameraModel, config: ThegraConfig, extractor: Extractor 
     return Slam(camera, config, extractor, matcher)
 
 
+def make_live_system(camera: CameraModel, config: ThegraConfig) -> System:
+    """The SLAM system with mapping in a process of its own."""
+    set_threads(config.threads)
+    from thegra_core.slam import Slam
+
+    return Slam(camera, config, beside=True)
+
+
 def _cached_front_end(config: ThegraConfig, folder: Path | None) -> tuple[()] | tuple[CachedExtractor, CachedMatcher]:
     if folder is None:
         return ()
@@ -161,15 +189,28 @@ def _cached_pct(front_end: Sequence[CachedExtractor | CachedMatcher]) -> float |
     return round(100 * hits / (hits + misses), 2) if hits + misses else None
 
 
-def _process(
+def _play(
     system: System, frames: Iterator[Frame], recording: Recording, progress: Progress, viewer: Viewer, interrupted: Callable[[], bool]
 ) -> tuple[_Done, float]:
-    """All frames through the system; returns also the seconds it took."""
+    """As `_process`, at the recording's own rate; frames that come too fast are dropped."""
+    latency_ms: list[float] = []
+    with Playback(frames) as playback:
+        done, wall_s = _process(system, iter(playback), recording, progress, viewer, interrupted, lambda: latency_ms.append(playback.latency_ms()))
+    done.dropped, done.latency_ms = playback.dropped, latency_ms
+    return done, wall_s
+
+
+def _process(
+    system: System, frames: Iterator[Frame], recording: Recording, progress: Progress, viewer: Viewer, interrupted: Callable[[], bool],
+    processed: Callable[[], None] = lambda: None,
+) -> tuple[_Done, float]:
+    """All frames through the system, `processed` called after each; returns also the seconds it took."""
     done, news, before = _Done(), News(), dict(recording.problems)
-    begin = time.perf_counter()
+    begin, cpu_begin = time.perf_counter(), time.process_time() + system.usage().cpu_s
     try:
         for frame in frames:
             result = system.process(frame)
+            processed()
             done.frames += 1
             done.reason = result.reason or done.reason
             if news.is_new(result):
@@ -183,6 +224,7 @@ def _process(
     except ThegraError as error:
         done.error = error
     wall_s = time.perf_counter() - begin
+    done.cpu_s = time.process_time() + system.usage().cpu_s - cpu_begin
     done.interrupted = done.interrupted or interrupted()
     done.unreadable = {reason: count - before.get(reason, 0) for reason, count in recording.problems.items() if count > before.get(reason, 0)}
     if done.interrupted:
@@ -238,10 +280,12 @@ def _no_frames(options: RunOptions, done: _Done) -> str:
     return f"no frame of {options.recording} lies in the part that --start and --duration choose{unreadable}\nits length is told by: thegra info {options.recording}"
 
 
-def _check_map_options(options: RunOptions) -> None:
+def _check_options(options: RunOptions) -> None:
     """Tell before the work what could not be done after it."""
     if options.localization_only and options.map is None:
         raise InputError("--localization-only needs a map to find the camera in: add --map FILE; a run writes one with --save-map FILE")
+    if options.realtime and options.cache is not None:
+        raise InputError("--realtime measures what the networks cost: leave --cache out")
     if options.save_map is not None and not options.save_map.absolute().parent.is_dir():
         raise InputError(f"--save-map {options.save_map}: the folder is not there; make it with: mkdir -p {shlex.quote(str(options.save_map.parent))}")
 

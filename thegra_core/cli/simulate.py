@@ -37,13 +37,22 @@ def simulate_command(values: dict[str, Any], size: str | None, assignments: Sequ
     console.print(f"recording  {made}\nrun it     thegra run {made}", soft_wrap=True, markup=False)
 
 
+def image_size(text: str) -> tuple[int, int]:
+    """(width, height) of a `--size`.
+
+    Raises:
+        ConfigError: If it is not WIDTHxHEIGHT.
+    """
+    match = _SIZE.fullmatch(text)
+    if match is None:
+        raise ConfigError(f"--size {text}: write WIDTHxHEIGHT, e.g. --size 640x512")
+    return int(match[1]), int(match[2])
+
+
 def _options(values: dict[str, Any], size: str | None, assignments: Sequence[str]) -> SimulationOptions:
     given = {key: value for key, value in values.items() if value is not None}
     if size is not None:
-        match = _SIZE.fullmatch(size)
-        if match is None:
-            raise ConfigError(f"--size {size}: write WIDTHxHEIGHT, e.g. --size 640x512")
-        given["image_size"] = (int(match[1]), int(match[2]))
+        given["image_size"] = image_size(size)
     sensor: dict[str, str] = {}
     for assignment in assignments:
         key, equals, value = assignment.partition("=")

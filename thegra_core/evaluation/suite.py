@@ -49,10 +49,12 @@ def make_suite(folder: Path, names: Iterable[str] | None = None, say: Callable[[
     Raises:
         InputError: If a folder holds another simulation, cannot be written, or the simulator's libraries are missing.
     """
-    return [_made(folder / name, SUITE[name], name, say) for name in (SUITE if names is None else names)]
+    return [make_recording(folder / name, SUITE[name], say) for name in (SUITE if names is None else names)]
 
 
-def _made(target: Path, options: SimulationOptions, name: str, say: Callable[[str, int, int], None] | None) -> Path:
+def make_recording(target: Path, options: SimulationOptions, say: Callable[[str, int, int], None] | None = None) -> Path:
+    """The recording of those options in the folder `target`, simulated if it is not there; arguments and errors as for `make_suite`."""
+    name = target.name
     content = options.model_dump_json(indent=2) + "\n"
     if target.is_dir():
         told = target / OPTIONS

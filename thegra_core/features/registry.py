@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thegra_core.config import ExtractorConfig, MatcherConfig
+from thegra_core.config import ExtractorConfig, MatcherConfig, ThegraConfig
 from thegra_core.errors import ConfigError
 from thegra_core.features.protocols import Extractor, Matcher
 
@@ -65,6 +65,19 @@ def make_matcher(config: MatcherConfig, extractor: ExtractorConfig) -> Matcher:
     from thegra_core.features.lightglue import LightGlue
 
     return LightGlue(config, extractor.name)
+
+
+def make_frame_matcher(config: ThegraConfig, matcher: Matcher | None = None) -> Matcher:
+    """The configured matcher, or the one given, for frames as the configured front end makes them.
+
+    Raises:
+        ConfigError, WeightsError: As `make_matcher`.
+    """
+    from thegra_core.features.tracks import TrackMatcher
+    from thegra_core.features.turning import TurningMatcher
+
+    learned = TurningMatcher(matcher if matcher is not None else make_matcher(config.matcher, config.extractor))
+    return TrackMatcher(learned, config.flow.min_shared) if config.flow.enabled else learned
 
 
 def matcher_name(config: MatcherConfig, extractor: ExtractorConfig) -> str:

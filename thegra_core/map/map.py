@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from thegra_core.geometry import poses
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.landmarks import LandmarkStore
-from thegra_core.messages import Features, Keyframe, MapUpdate
+from thegra_core.messages import Features, Keyframe, MapSummary, MapUpdate
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -107,9 +107,9 @@ class Map:
 
     def apply(self, update: MapUpdate) -> None:
         """Make this replica equal to the map that sent the update. Updates must come in the order of their versions."""
-        for keyframe_id in update.removed_keyframe_ids:
-            self.keyframes.pop(keyframe_id, None)
-            self.covisibility.pop(keyframe_id, None)
+        for removed in update.removed_keyframes:
+            self.keyframes.pop(removed.id, None)
+            self.covisibility.pop(removed.id, None)
         self.keyframes.update((keyframe.id, keyframe) for keyframe in make_keyframes(update.new_keyframes, self.camera))
         for state in update.keyframes:
             keyframe = self.keyframes[state.id]
@@ -120,3 +120,16 @@ class Map:
         self.landmarks.remove(update.removed_landmark_ids)
         self.covisibility.update(update.covisibility)
         self.version = update.version
+
+
+def summarize(current: Map) -> MapSummary:
+    """A copy of what a map holds, for outputs."""
+    keyframes = [current.keyframes[i] for i in sorted(current.keyframes)]
+    landmarks = current.landmarks.get(current.landmarks.alive_ids()) if len(current.landmarks) else None
+    return MapSummary(
+        map_id=current.map_id,
+        keyframe_stamps_ns=np.array([k.stamp_ns for k in keyframes], dtype=np.int64),
+        keyframe_poses=np.array([k.world_from_camera for k in keyframes]).reshape(-1, 4, 4),
+        points_world=landmarks.points_world if landmarks is not None else np.empty((0, 3)),
+        point_scores=landmarks.scores if landmarks is not None else np.empty(0, np.float32),
+    )

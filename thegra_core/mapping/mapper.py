@@ -8,26 +8,33 @@ from pathlib import Path
 import numpy as np
 
 from thegra_core.config import ThegraConfig
+from thegra_core.errors import InputError
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.editor import MapEditor
-from thegra_core.map.map import Map
+from thegra_core.map.map import Map, summarize
 from thegra_core.mapping import culling
 from thegra_core.mapping.adjustment import adjust_all, adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
 from thegra_core.mapping.expansion import expand
+from thegra_core.mapping.full_adjustment import FullAdjustments
 from thegra_core.mapping.loop_closing import LoopCloser
 from thegra_core.mapping.merging import MapMerger, merge
 from thegra_core.mapping.persistence import KeptMap, load_map, save_map
 from thegra_core.messages import Absorbed, InitialMap, Keyframe, MapSummary, MapUpdate, Matches
+from thegra_core.optimization.solver import BundleSolver, InlineSolver
 
 logger = logging.getLogger(__name__)
 
 
 class Mapper:
-    """Keyframes in, map updates out (paper Sec. III-C). Not thread-safe: one caller at a time."""
+    """Keyframes in, map updates out (paper Sec. III-C). Not thread-safe: one caller at a time.
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher) -> None:
+    Args:
+        solver: Makes the full adjustments after loops and merges. The default makes them in the calling thread, at a fixed keyframe: a run can be repeated.
+    """
+
+    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher, solver: BundleSolver | None = None) -> None:
         self._camera = camera
         self._config = config
         self._matcher = matcher
@@ -36,6 +43,7 @@ class Mapper:
         self._graphs: dict[int, MatchGraph] = {}
         self._loops: dict[int, LoopCloser] = {}
         self._merger = MapMerger(config, matcher)
+        self._full = FullAdjustments(solver or InlineSolver(), config)
         self.merges = 0
 
     def initialize(self, initial: InitialMap) -> MapUpdate:
@@ -63,19 +71,25 @@ class Mapper:
         return editor.take_update()
 
     def insert(self, keyframe: Keyframe) -> MapUpdate:
-        """Insert a keyframe: observations, culling, expansion with its neighbours, local bundle adjustment."""
+        """Insert a keyframe: observations, culling, expansion with its neighbours, local bundle adjustment; then what it may tie together.
+
+        A full adjustment that is done comes in before the local one, which smooths the seams to what has come since.
+        """
         editor = self._editors[keyframe.map_id]
         editor.add_keyframe(keyframe)
         editor.connect(keyframe.id)
         self._cull(editor, keyframe)
         self._expand(editor, keyframe)
         editor.connect(keyframe.id)
+        self._thin(editor, keyframe.id)
+        self._full.collect(editor)
         adjust_locally(editor, keyframe.id, self._config)
         editor.connect(keyframe.id)
         loops = self._loops[keyframe.map_id]
         loops.index.add(keyframe.id, keyframe.features)
         if self._config.loop.enabled:
-            loops.look(editor, keyframe.id, self._graphs[keyframe.map_id])
+            if loops.look(editor, keyframe.id, self._graphs[keyframe.map_id]):
+                self._full.start(editor)
             merged = self._merge(editor, keyframe.id)
             if merged is not None:
                 return merged
@@ -84,6 +98,7 @@ class Mapper:
     def finish(self, map_id: int) -> MapUpdate:
         """Full bundle adjustment of a map at the end of a run."""
         editor = self._editors[map_id]
+        self._full.cancel(map_id)
         adjust_all(editor, self._config)
         return editor.take_update()
 
@@ -95,6 +110,16 @@ class Mapper:
         """
         kept = KeptMap(self._editors[map_id], self._graphs[map_id], self._loops[map_id].index, self._trial[map_id])
         save_map(path, kept, self._config)
+
+    def save_largest(self, path: Path) -> None:
+        """Write the map with most keyframes, the older of equals.
+
+        Raises:
+            InputError: If there is none, or the file cannot be written.
+        """
+        if not self._editors:
+            raise InputError(f"there is no map yet that could be written to {path}")
+        self.save(max(self._editors, key=lambda i: (len(self._editors[i].map.keyframes), -i)), path)
 
     def load(self, path: Path) -> MapUpdate:
         """Take a map from a file, beside those that are there; returns the whole of it as an update.
@@ -117,6 +142,7 @@ class Mapper:
 
     def drop(self, map_id: int) -> None:
         """Forget a map that tracking has given up."""
+        self._full.cancel(map_id)
         del self._editors[map_id], self._trial[map_id], self._graphs[map_id], self._loops[map_id]
 
     @property
@@ -133,17 +159,8 @@ class Mapper:
         return self._editors[map_id].map
 
     def summary(self, map_id: int) -> MapSummary:
-        """A copy of what a finished map holds, for outputs."""
-        current = self._editors[map_id].map
-        keyframes = [current.keyframes[i] for i in sorted(current.keyframes)]
-        landmarks = current.landmarks.get(current.landmarks.alive_ids()) if len(current.landmarks) else None
-        return MapSummary(
-            map_id=map_id,
-            keyframe_stamps_ns=np.array([k.stamp_ns for k in keyframes], dtype=np.int64),
-            keyframe_poses=np.array([k.world_from_camera for k in keyframes]).reshape(-1, 4, 4),
-            points_world=landmarks.points_world if landmarks is not None else np.empty((0, 3)),
-            point_scores=landmarks.scores if landmarks is not None else np.empty(0, np.float32),
-        )
+        """A copy of what a map holds, for outputs."""
+        return summarize(self._editors[map_id].map)
 
     def _merge(self, editor: MapEditor, keyframe_id: int) -> MapUpdate | None:
         """The whole of an older map that a map has become part of, if this keyframe ties them."""
@@ -159,11 +176,12 @@ class Mapper:
         for sighting in tie.sightings:
             for other, matches in sighting.matches.items():
                 graph.add(sighting.keyframe_id, other, matches)
-        for i, keyframe in sorted(editor.map.keyframes.items()):
-            self._loops[tie.old_map_id].index.add(i, keyframe.features)
+        for i, joined in sorted(editor.map.keyframes.items()):
+            self._loops[tie.old_map_id].index.add(i, joined.features)
         self._loops[tie.old_map_id].closed += self._loops[map_id].closed
         self._trial[tie.old_map_id].extend(renamed[i] for i in self._trial[map_id] if i in renamed)
         self.drop(map_id)
+        self._full.start(old)
         self.merges += 1
         return old.take_update(Absorbed(map_id, similarity.rigid, similarity.scale))
 
@@ -174,6 +192,12 @@ class Mapper:
             editor.remove_landmarks(culling.untrackable(editor, concerned, self._config.mapping))
         remove, self._trial[keyframe.map_id] = culling.failed_trial(editor, trial, keyframe.id, self._config.mapping)
         editor.remove_landmarks(remove)
+
+    def _thin(self, editor: MapEditor, keyframe_id: int) -> None:
+        """Let redundant keyframes go; the newest stay, which tracking and the search for loops hold on to."""
+        for removed in culling.remove_redundant(editor, keyframe_id, self._config.mapping):
+            self._graphs[editor.map.map_id].remove(removed)
+            self._loops[editor.map.map_id].index.remove(removed)
 
     def _expand(self, editor: MapEditor, keyframe: Keyframe) -> None:
         """Match the keyframe to its neighbours, the reference first, whose matches tracking already has, and through them to theirs."""

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from thegra_core.config import ThegraConfig
-from thegra_core.messages import FrameRecord, Run, TrackingState
+from thegra_core.messages import FrameRecord, Revisit, Run, TrackingState
 from thegra_core.outputs.scoring import Score, path_length, score_trajectory, within
 from thegra_core.outputs.trajectory import NS_PER_S, Trajectory, final_trajectory, live_trajectory
+from thegra_core.process import own_usage
 from thegra_core.version import VERSION
 
 TOTAL = "total"
@@ -28,7 +28,8 @@ class Timing:
     """What the run cost.
 
     wall_s covers all frames, without the work after the last one (`finish_s`); frames_read counts the frames that were handed to the system.
-    cached_pct is the share of the networks' results that came from a cache, None without one.
+    cached_pct is the share of the networks' results that came from a cache, None without one. latency_ms, of a recording that was played at its own rate:
+    from a frame's delivery to its pose. cpu_s: of all processes and cores, for the frames of `wall_s`. apart_rss_mb: the most memory of a process beside this.
     """
 
     wall_s: float
@@ -36,6 +37,9 @@ class Timing:
     finish_s: float = 0.0
     dropped_frames: int = 0
     cached_pct: float | None = None
+    latency_ms: Sequence[float] = ()
+    cpu_s: float = 0.0
+    apart_rss_mb: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +71,7 @@ def run_metrics(
     tracked = [f for f in run.frames if f.world_from_camera is not None]
     in_main = sum(f.map_id == run.main_map_id for f in tracked)
     bad = dict(Counter(run.bad_frames) + Counter(unreadable or {}))
-    total = max(timing.frames_read, len(run.frames)) + sum((unreadable or {}).values())
+    total = max(timing.frames_read, len(run.frames)) + timing.dropped_frames + sum((unreadable or {}).values())
     metrics: dict[str, Any] = {
         "frames_total": total,
         "frames_tracked": in_main,
@@ -88,15 +92,30 @@ def run_metrics(
         "relocalizations": run.relocalizations,
         "loops": run.loops,
         "merges": run.merges,
+        "loop_events": [_revisit(r) for r in run.revisits],
+        "loss_events": _losses(run),
         "shutter_closures": [[begin / NS_PER_S, end / NS_PER_S] for begin, end in run.shutter_closures_ns],
     }
     return metrics | (_score_metrics(scores) if scores else {}) | _time_metrics(run, timing) | {"seed": config.seed, "profile": config.profile, "version": VERSION}
 
 
-def peak_rss_mb() -> float:
-    """Largest resident memory of this process so far, MiB."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20) if sys.platform == "darwin" else peak / 1024
+def _revisit(revisit: Revisit) -> dict[str, Any]:
+    """A loop or a merge: when, which keyframes, by how many landmarks, and what it set right (`moved` in median scene depths)."""
+    facts = asdict(revisit)
+    facts["stamp_s"] = facts.pop("stamp_ns") / NS_PER_S
+    return {"kind": "loop" if revisit.is_loop else "merge", **facts}
+
+
+def _losses(run: Run) -> list[dict[str, Any]]:
+    """Each time that tracking was lost: when, why, and when it went on (None: it did not) in which map."""
+    found: list[dict[str, Any]] = []
+    told = [f.result for f in run.frames if f.result.reason not in run.bad_frames and f.result.state is not TrackingState.HOLD]
+    for before, result in pairwise(told):
+        if result.state is TrackingState.LOST and before.state in (TrackingState.TRACKING, TrackingState.RELOCALIZING):
+            found.append({"lost_s": result.stamp_ns / NS_PER_S, "reason": result.reason, "found_s": None, "map_id": None})
+        elif result.state is TrackingState.TRACKING and found and found[-1]["found_s"] is None:
+            found[-1] |= {"found_s": result.stamp_ns / NS_PER_S, "map_id": result.map_id}
+    return found
 
 
 def percentiles(values: Sequence[float] | np.ndarray[Any, Any], which: Iterable[int]) -> dict[str, float | None]:
@@ -134,12 +153,14 @@ def _time_metrics(run: Run, timing: Timing) -> dict[str, Any]:
     return {
         "fps": round(timing.frames_read / timing.wall_s, 3) if timing.wall_s > 0 else None,
         "ms_per_frame": percentiles(frame_ms, (50, 95, 99)),
-        "ms": {stage: percentiles(values, (50, 95)) for stage, values in stages.items()},
+        "ms": {stage: percentiles(values, (50, 95, 99)) for stage, values in stages.items()},
         "wall_s": round(timing.wall_s, 3),
         "finish_s": round(timing.finish_s, 3),
         "dropped_frames": timing.dropped_frames,
+        "latency_ms": percentiles(timing.latency_ms, (50, 95, 99)),
+        "cpu_s_per_frame": round(timing.cpu_s / timing.frames_read, 4) if timing.frames_read else None,
         "cached_pct": timing.cached_pct,
-        "peak_rss_mb": round(peak_rss_mb(), 1),
+        "peak_rss_mb": round(own_usage().peak_rss_mb + timing.apart_rss_mb, 1),
     }
 
 

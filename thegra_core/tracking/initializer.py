@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,9 @@ from thegra_core.features.protocols import Matcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import NO_LANDMARK, Features, InitialMap, Keyframe, Matches
 from thegra_core.optimization.weighting import observation_weights
+from thegra_core.process import Submit, call_now
 from thegra_core.tracking.first_map import FirstMap, TrackTable, distinct, solve_first_map
-from thegra_core.tracking.hypotheses import motion_hypotheses, parallax_to_noise
+from thegra_core.tracking.hypotheses import MotionHypothesis, motion_hypotheses, parallax_to_noise
 
 FloatArray = NDArray[np.float64]
 logger = logging.getLogger(__name__)
@@ -31,19 +33,31 @@ class _Candidate:
     to_reference: Matches | None = field(default=None)
 
 
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """What is being solved: views, the matches of the last to the first, and the `FirstMap` to come, or why there is none."""
+
+    views: list[_Candidate]
+    matches: Matches
+    solution: Future[FirstMap | str]
+
+
 class Initializer:
     """Collects frames until a map can be claimed.
 
-    `reference_features` is the frame that the next one should be matched to. Every refusal gives its reason in words.
+    `reference_features` is the frame that the next one should be matched to. Every refusal gives its reason in words. What takes long, the bundle
+    adjustment under each hypothesis, is done by `submit`; while it has not come back, frames are only collected.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher) -> None:
+    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher, submit: Submit = call_now) -> None:
         self._camera = camera
         self._config = config
         self._matcher = matcher
         self._rng = np.random.default_rng(config.seed)
         self._frames: list[_Candidate] = []  # the first is the reference
         self._starved = 0
+        self._submit = submit
+        self._attempt: _Attempt | None = None
 
     @property
     def reference_features(self) -> Features | None:
@@ -53,9 +67,13 @@ class Initializer:
         """Forget all frames, for example after a shutter closure that changed the image."""
         self._frames = []
         self._starved = 0
+        self._attempt = None
 
     def add(self, features: Features, matches: Matches | None, map_id: int, next_keyframe_id: int) -> InitialMap | str:
-        """The next frame, with its matches to `reference_features` if there are any already; a first map, or why there is none yet."""
+        """The next frame, with its matches to `reference_features` if there are any already; a first map, or why there is none yet.
+
+        The map's last keyframe is this frame, or an earlier one where solving took its time.
+        """
         settings = self._config.initialization
         normalized = self._camera.undistort(features.keypoints.astype(np.float64))
         self._frames.append(_Candidate(features, normalized, observation_weights(features.scores, self._config.weighting)))
@@ -65,10 +83,19 @@ class Initializer:
             matches = self._matcher.match(features, self._frames[0].features)
         matches = self._advance_reference(matches)
         self._frames[-1].to_reference = matches
+        if self._attempt is not None:
+            return self._outcome(self._attempt, map_id, next_keyframe_id)
         if len(matches) < settings.min_matches:
             return f"{len(matches)} matches to the reference frame, {settings.min_matches} needed: move more slowly, or towards more thermal contrast"
-        solved = self._attempt(matches)
-        return solved if isinstance(solved, str) else self._as_map(solved[0], solved[1], matches, map_id, next_keyframe_id)
+        attempt = self._begin_attempt(matches)
+        return attempt if isinstance(attempt, str) else self._outcome(attempt, map_id, next_keyframe_id)
+
+    def _outcome(self, attempt: _Attempt, map_id: int, next_keyframe_id: int) -> InitialMap | str:
+        if not attempt.solution.done():
+            self._attempt = attempt
+            return "a first map is being solved"
+        self._attempt, solved = None, attempt.solution.result()
+        return solved if isinstance(solved, str) else self._as_map(solved, attempt.views, attempt.matches, map_id, next_keyframe_id)
 
     def _advance_reference(self, matches: Matches) -> Matches:
         """Paper: too few correspondences over too long a gap advance the reference frame, half the gap at a time.
@@ -86,7 +113,7 @@ class Initializer:
                 self._starved = 0
         return matches
 
-    def _attempt(self, matches: Matches) -> tuple[FirstMap, list[_Candidate]] | str:
+    def _begin_attempt(self, matches: Matches) -> _Attempt | str:
         settings = self._config.initialization
         reference, current = self._frames[0], self._frames[-1]
         x0, x1 = reference.normalized[matches.indices[:, 1]], current.normalized[matches.indices[:, 0]]
@@ -100,27 +127,8 @@ class Initializer:
         if ratio < needed:
             return f"no parallax: a pure rotation explains the matches to {flow:.1f} px, {ratio:.1f} times their noise, {needed:.1f} needed: move sideways"
         views = [reference, *self._between(), current]
-        table = self._tabulate(views, matches)
-        solved = [m for h in hypotheses if (m := solve_first_map(table, h.camera1_from_camera0, h.model, self._config)) is not None]
-        if not solved:
-            return "no motion explains the matches: moving objects, or wrong intrinsics"
-        return self._decide(sorted(solved, key=lambda m: m.cost), views)
-
-    def _decide(self, solved: list[FirstMap], views: list[_Candidate]) -> tuple[FirstMap, list[_Candidate]] | str:
-        settings = self._config.initialization
-        best = solved[0]
-        logger.debug("start: %s", [(m.model, round(m.cost, 3), int(m.good.sum()), round(m.parallax_deg, 2)) for m in solved])
-        if best.good.sum() < settings.min_points:
-            return f"{int(best.good.sum())} points triangulated, {settings.min_points} needed: move sideways, or towards more thermal contrast"
-        share = float(best.good.mean())
-        if share < settings.min_inlier_ratio:
-            return f"the best motion explains {100 * share:.0f} % of the matches, {100 * settings.min_inlier_ratio:.0f} % needed: moving objects, or wrong intrinsics"
-        if best.parallax_deg < settings.min_parallax_deg:
-            return f"parallax {best.parallax_deg:.2f} deg, {settings.min_parallax_deg:g} needed: move sideways"
-        others = [m for m in solved[1:] if distinct(best, m)]
-        if others and others[0].cost < settings.ambiguity_ratio * best.cost:
-            return "the scene looks flat and two motions explain it alike: keep moving, further views decide"
-        return best, views
+        views = [replace(view) for view in views]  # of its own: the reference may advance meanwhile
+        return _Attempt(views, matches, self._submit(decide, self._tabulate(views, matches), hypotheses, self._config))
 
     def _between(self) -> list[_Candidate]:
         """Frames evenly spread between reference and current, matched to the reference when they are not yet."""
@@ -167,3 +175,25 @@ class Initializer:
             reference_id = next_keyframe_id if row else -1
             keyframes.append(Keyframe(next_keyframe_id + row, view.features.stamp_ns, pose, view.features, ids, reference_id, map_id, view.to_reference))
         return InitialMap(map_id, tuple(keyframes), scale * solved.points_world[solved.good])
+
+
+def decide(table: TrackTable, hypotheses: list[MotionHypothesis], config: ThegraConfig) -> FirstMap | str:
+    """The first map that explains the matches best, or why none may be claimed."""
+    settings = config.initialization
+    attempts = (solve_first_map(table, h.camera1_from_camera0, h.model, config) for h in hypotheses)
+    solved = sorted((m for m in attempts if m is not None), key=lambda m: m.cost)
+    if not solved:
+        return "no motion explains the matches: moving objects, or wrong intrinsics"
+    best = solved[0]
+    logger.debug("start: %s", [(m.model, round(m.cost, 3), int(m.good.sum()), round(m.parallax_deg, 2)) for m in solved])
+    if best.good.sum() < settings.min_points:
+        return f"{int(best.good.sum())} points triangulated, {settings.min_points} needed: move sideways, or towards more thermal contrast"
+    share = float(best.good.mean())
+    if share < settings.min_inlier_ratio:
+        return f"the best motion explains {100 * share:.0f} % of the matches, {100 * settings.min_inlier_ratio:.0f} % needed: moving objects, or wrong intrinsics"
+    if best.parallax_deg < settings.min_parallax_deg:
+        return f"parallax {best.parallax_deg:.2f} deg, {settings.min_parallax_deg:g} needed: move sideways"
+    others = [m for m in solved[1:] if distinct(best, m)]
+    if others and others[0].cost < settings.ambiguity_ratio * best.cost:
+        return "the scene looks flat and two motions explain it alike: keep moving, further views decide"
+    return best

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
-from thegra_core.features.protocols import Matcher
+from thegra_core.features.protocols import Matcher, Wanted
 from thegra_core.geometry import poses
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.geometry.similarity import Similarity
@@ -28,6 +29,8 @@ from thegra_core.messages import (
     VisibilityCounts,
 )
 from thegra_core.places.index import PlaceIndex
+from thegra_core.process import Submit, call_now
+from thegra_core.tracking.followed import TrackLandmarks, localize_followed
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
 from thegra_core.tracking.motion import MotionModel
@@ -45,6 +48,8 @@ class TrackingOutput:
 
     While a new map is on probation nothing is claimed: `result` has no pose, and `provisional` is the result that holds if the map stands.
     `dropped_map_id` names a map that did not stand. landmark_ids (N,) per keypoint and the matches used are for viewers; None where there are none.
+    found_turned: the frame's features of another orientation, by which it was found; landmark_ids and matches are theirs, and the next frames had better be
+    turned alike.
     """
 
     result: TrackingResult
@@ -54,6 +59,7 @@ class TrackingOutput:
     matches: Matches | None = None
     provisional: TrackingResult | None = None
     dropped_map_id: int | None = None
+    found_turned: Features | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +76,8 @@ class LateLocalization:
 class _Place:
     """Where tracking is: a replica of a map and of its places, keyframes of it, and what has been seen since the last one.
 
-    resumed: the map was made in another run, so that its stamps say nothing about this one.
+    resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet, and
+    their poses.
     """
 
     map: Map
@@ -84,15 +91,33 @@ class _Place:
     motion: MotionModel = field(default_factory=MotionModel)
     visible: list[IntArray] = field(default_factory=list)
     found: list[IntArray] = field(default_factory=list)
+    tracks: TrackLandmarks = field(default_factory=TrackLandmarks)
+    pending: dict[int, FloatArray] = field(default_factory=dict)
+
+    @property
+    def begun(self) -> bool:
+        """Whether mapping has made the first keyframes of the map."""
+        return self.reference_id in self.map.keyframes
 
     @property
     def reference(self) -> Features:
         return self.map.keyframes[self.reference_id].features
 
+    @property
+    def last_keyframe_pose(self) -> FloatArray:
+        return self.pending[max(self.pending)] if self.pending else self.map.keyframes[self.last_keyframe_id].world_from_camera
+
     def take(self, update: MapUpdate) -> None:
         self.map.apply(update)
+        for removed in update.removed_keyframes:
+            self.places.remove(removed.id)
+        for message in update.new_keyframes:
+            self.pending.pop(message.id, None)
         for message in update.new_keyframes:
             self.places.add(message.id, message.features)
+        for state in update.keyframes:
+            if state.id == self.last_keyframe_id:
+                self.tracks.take(self.map.keyframes[state.id].features, state.landmark_ids)
 
     def predict(self, stamp_ns: int) -> FloatArray | None:
         return self.motion.predict(stamp_ns) if self.lost_frames == 0 else None
@@ -109,14 +134,15 @@ class _Place:
 class TrackingStage:
     """State of tracking: the place in the current map, the map before it while a new one is on probation, and the search for a first map.
 
-    Call `process` (or `hold`) once a frame, hand what it returns to mapping, and `apply` every update that mapping sends back.
+    Call `process` (or `hold`) once a frame, hand what it returns to mapping, and `apply` every update that mapping sends back. What takes long at the start
+    of a map is done by `submit`.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher) -> None:
+    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher, submit: Submit = call_now) -> None:
         self._camera = camera
         self._config = config
         self._matcher = matcher
-        self._initializer = Initializer(camera, config, matcher)
+        self._initializer = Initializer(camera, config, matcher, submit)
         self._place: _Place | None = None
         self._before: _Place | None = None
         self._next_keyframe_id = 0
@@ -129,23 +155,54 @@ class TrackingStage:
     @property
     def reference_features(self) -> Features | None:
         """What the front end should match the next frame to."""
-        return self._initializer.reference_features if self._place is None else self._place.reference
+        if self._place is None:
+            return self._initializer.reference_features
+        return self._place.reference if self._place.begun else None
+
+    @property
+    def map(self) -> Map | None:
+        """The replica of the current map; read it and change nothing."""
+        return self._place.map if self._place is not None else None
 
     @property
     def map_id(self) -> int:
         return self._place.map.map_id if self._place is not None else -1
 
-    def process(self, features: Features, matches: Matches | None) -> TrackingOutput:
-        """Track one frame; `matches` are to `reference_features` (None: not matched yet)."""
+    def process(self, features: Features, matches: Matches | None, turned: Iterable[Features] = ()) -> TrackingOutput:
+        """Track one frame; `matches` are to `reference_features` (None: not matched yet). `turned` gives its features of other orientations, taken as needed."""
         place = self._place
         if place is None:
             return self._start(features, matches)
+        if not place.begun:
+            return self._wait_for_map(place, features)
         if matches is None or matches.reference_stamp_ns != place.reference.stamp_ns:
             matches = self._matcher.match(features, place.reference)
         found = localize(place.map, features, place.reference_id, {place.reference_id: matches}, place.predict(features.stamp_ns), self._config)
         if isinstance(found, str):
-            return self._recover(place, features, matches, found)
+            return self._recover(place, features, matches, found, turned)
         return self._accept(place, features, found, matches)
+
+    def process_followed(self, features: Features, matches: Matches | None) -> TrackingOutput | Wanted:
+        """Track one frame by keypoints that were followed to it; `matches` as for `process`.
+
+        Instead of an answer, what `process` should get of the same image: more features if a keyframe is due, other ones if these give no pose.
+        """
+        place = self._place
+        if place is None:
+            return self._start(features, matches)
+        if not place.begun:
+            return self._wait_for_map(place, features)
+        if place.lost_frames or place.search_frames:
+            return Wanted.ANEW
+        assert features.track_ids is not None
+        landmark_ids = place.tracks.of(features.track_ids)
+        found = localize_followed(place.map, features, landmark_ids, place.predict(features.stamp_ns), self._config)
+        if isinstance(found, str):
+            logger.debug("followed keypoints at %.3f s: %s", features.stamp_ns / 1e9, found)
+            return Wanted.ANEW
+        if self._keyframe_due(place, found):
+            return Wanted.MORE
+        return self._accept_followed(place, features, found, matches)
 
     def hold(self, stamp_ns: int, reason: str) -> TrackingOutput:
         """A frame that shows nothing (shutter closed): the pose is predicted, and marked as that; not for longer than a closure can last."""
@@ -194,6 +251,7 @@ class TrackingStage:
         if before:
             newest = max(before)
             place.reference_id = place.last_keyframe_id = newest
+            place.tracks.take(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
             corrected = Similarity(place.map.keyframes[newest].world_from_camera, update.scales.get(newest, 1.0))
             place.motion.move(corrected @ Similarity(before[newest]).inverse())
 
@@ -205,9 +263,19 @@ class TrackingStage:
         place.map, place.places = Map(update.map_id, self._camera), self._place_index()
         place.take(update)
         place.motion.move(Similarity(absorbed.rigid, absorbed.scale))
-        place.reference_id = place.last_keyframe_id = max(m.id for m in update.new_keyframes)
+        place.reference_id = place.last_keyframe_id = newest = max(m.id for m in update.new_keyframes)
+        place.tracks.replace(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
         place.probation, self._before = 0, None
-        place.visible, place.found = [], []
+        place.visible, place.found, place.pending = [], [], {}
+
+    def relative_to_reference(self, result: TrackingResult) -> tuple[int, FloatArray]:
+        """A keyframe of the current map and reference_from_camera (4, 4) of a result that has a pose; one that mapping does not know yet is its own."""
+        assert self._place is not None and result.world_from_camera is not None
+        keyframes = self._place.map.keyframes
+        if result.is_keyframe and (result.reference_id in keyframes or not self._place.begun):
+            return result.reference_id, np.eye(4)
+        reference_id = result.reference_id if result.reference_id in keyframes else self._place.reference_id
+        return reference_id, keyframes[reference_id].camera_from_world @ result.world_from_camera
 
     def drop_unproven(self) -> int | None:
         """At the end of a run: give up a map that is still on probation; its id, or None."""
@@ -240,6 +308,12 @@ class TrackingStage:
             return TrackingOutput(result, matches=matches)
         return self._begin_map(features, initial)
 
+    def _wait_for_map(self, place: _Place, features: Features) -> TrackingOutput:
+        """Mapping has not made the new map yet."""
+        self._unplaced.append(features)
+        state = TrackingState.INITIALIZING if self._before is None else TrackingState.LOST
+        return TrackingOutput(TrackingResult(features.stamp_ns, state, keypoints=len(features), map_id=place.map.map_id, reason="a new map is being made"))
+
     def _begin_map(self, features: Features, initial: InitialMap) -> TrackingOutput:
         last = initial.keyframes[-1]
         place = _Place(Map(initial.map_id, self._camera), self._place_index(), last.id, last.id, self._config.initialization.probation_frames)
@@ -248,6 +322,8 @@ class TrackingStage:
         self._before, self._place = self._place, place
         self._next_map_id += 1
         self._next_keyframe_id += len(initial.keyframes)
+        if last.stamp_ns != features.stamp_ns:  # it was solved meanwhile: the frames to come are tracked in it
+            return replace(self._wait_for_map(place, features), initial_map=initial)
         keypoints = np.flatnonzero(last.landmark_ids != NO_LANDMARK)
         estimate = FrameView(features, self._camera, self._config).refine(
             poses.inverse(last.world_from_camera), initial.points_world[last.landmark_ids[keypoints]], keypoints, self._config.tracking.chi2_px2
@@ -265,22 +341,35 @@ class TrackingStage:
             self.relocalizations += 1
             place.motion.reset()
         place.search_frames = 0
-        place.probation = max(0, place.probation - 1)
-        world_from_camera = found.world_from_camera
-        place.motion.update(features.stamp_ns, world_from_camera, found.covariance)
-        if not self.localization_only:
-            place.visible.append(found.visible_ids)
-            place.found.append(found.landmark_ids[found.landmark_ids >= 0])
+        self._note(place, features, found)
+        place.tracks.replace(features, found.landmark_ids)
         matched_to = place.reference_id
         keyframe = self._as_keyframe(place, features, found, matches)
         if keyframe is None:
             local = place.map.local_keyframes(place.reference_id, self._config.tracking.local_keyframes)
             place.reference_id = best_reference(place.map, found.landmark_ids, local)
-        result = TrackingResult(
-            features.stamp_ns, TrackingState.TRACKING, world_from_camera, found.covariance, place.motion.twist(), len(features), found.matches,
-            found.inliers, len(found.visible_ids), keyframe is not None, place.map.map_id, keyframe.id if keyframe is not None else matched_to,
-        )  # fmt: skip
+        result = self._result(place, features, found, keyframe.id if keyframe is not None else matched_to, keyframe is not None)
         return self._claim(place, features, TrackingOutput(result, keyframe, landmark_ids=found.landmark_ids, matches=matches))
+
+    def _accept_followed(self, place: _Place, features: Features, found: Localization, matches: Matches | None) -> TrackingOutput:
+        self._note(place, features, found)
+        result = self._result(place, features, found, place.reference_id, is_keyframe=False)
+        return self._claim(place, features, TrackingOutput(result, landmark_ids=found.landmark_ids, matches=matches))
+
+    def _note(self, place: _Place, features: Features, found: Localization) -> None:
+        """A frame was placed: motion goes on from it, and its landmarks were seen."""
+        place.probation = max(0, place.probation - 1)
+        place.motion.update(features.stamp_ns, found.world_from_camera, found.covariance)
+        if not self.localization_only:
+            place.visible.append(found.visible_ids)
+            place.found.append(found.landmark_ids[found.landmark_ids >= 0])
+
+    @staticmethod
+    def _result(place: _Place, features: Features, found: Localization, reference_id: int, is_keyframe: bool) -> TrackingResult:
+        return TrackingResult(
+            features.stamp_ns, TrackingState.TRACKING, found.world_from_camera, found.covariance, place.motion.twist(), len(features), found.matches,
+            found.inliers, len(found.visible_ids), is_keyframe, place.map.map_id, reference_id,
+        )  # fmt: skip
 
     def _claim(self, place: _Place, features: Features, output: TrackingOutput) -> TrackingOutput:
         """The output as it may be told: a pose only once the map has stood its probation."""
@@ -296,43 +385,56 @@ class TrackingStage:
 
     def _as_keyframe(self, place: _Place, features: Features, found: Localization, matches: Matches) -> Keyframe | None:
         """The frame as a keyframe message if one is due."""
-        if self.localization_only:
-            return None
-        last, reference = place.map.keyframes[place.last_keyframe_id], place.map.keyframes[place.reference_id]
-        tracked_ratio = found.inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
-        depth = place.map.median_depth(place.reference_id, found.world_from_camera)
-        if not needs_keyframe(last.world_from_camera, found.world_from_camera, depth, tracked_ratio, self._config.keyframe):
+        if not self._keyframe_due(place, found):
             return None
         keyframe = Keyframe(
             self._next_keyframe_id, features.stamp_ns, found.world_from_camera, features, found.landmark_ids, place.reference_id, place.map.map_id,
             matches, place.take_counts(),
         )  # fmt: skip
         self._next_keyframe_id += 1
+        place.pending[keyframe.id] = keyframe.world_from_camera
         return keyframe
 
-    def _recover(self, place: _Place, features: Features, matches: Matches, reason: str) -> TrackingOutput:
+    def _keyframe_due(self, place: _Place, found: Localization) -> bool:
+        if self.localization_only or len(place.pending) >= self._config.keyframe.most_pending:
+            return False
+        reference = place.map.keyframes[place.reference_id]
+        tracked_ratio = found.inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
+        depth = place.map.median_depth(place.reference_id, found.world_from_camera)
+        return bool(needs_keyframe(place.last_keyframe_pose, found.world_from_camera, depth, tracked_ratio, self._config.keyframe))
+
+    def _recover(self, place: _Place, features: Features, matches: Matches, reason: str, turned: Iterable[Features]) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
         if place.probation:
             dropped = self._drop()
             logger.info("map %s did not stand its probation: %s", dropped, reason)
             output = self._start(features, None) if self._place is None else self._stay_lost(self._place, features, reason)
             return replace(output, dropped_map_id=dropped)
-        settings = self._config.relocalization
-        if place.lost_frames == 0:
-            candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
-        else:
-            candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
-        least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
-        found = relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
+        found = self._seek(place, features, matches)
         if found is not None:
             place.reference_id = found[1]
             return self._accept(place, features, found[0], found[2])
+        for other in turned if place.lost_frames < self._config.relocalization.new_map_after_frames else ():
+            found = self._seek(place, other, self._matcher.match(other, place.reference))
+            if found is not None:
+                place.reference_id = found[1]
+                return replace(self._accept(place, other, found[0], found[2]), found_turned=other)
         if place.search_frames:
             place.search_frames -= 1
             self._unplaced.append(features)
             result = TrackingResult(features.stamp_ns, TrackingState.RELOCALIZING, keypoints=len(features), map_id=place.map.map_id, reason=reason)
             return TrackingOutput(result)
         return self._stay_lost(place, features, reason)
+
+    def _seek(self, place: _Place, features: Features, matches: Matches) -> tuple[Localization, int, Matches] | None:
+        """Match a frame to the last keyframes or, once it is lost, to those that look most alike; `matches` are to the reference."""
+        settings = self._config.relocalization
+        if place.lost_frames == 0:
+            candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
+        else:
+            candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
+        least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
+        return relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:

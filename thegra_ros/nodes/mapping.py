@@ -19,6 +19,7 @@ from thegra_core.features.registry import make_matcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.messages import MapUpdate
+from thegra_core.optimization.solver import ProcessSolver
 from thegra_ros.camera_input import CameraInput
 from thegra_ros.camera_place import CameraPlace
 from thegra_ros.codec.clouds import Table
@@ -106,7 +107,7 @@ class MappingNode(StageNode):
         self._show(mapper, main, stamp)
 
     def _new(self, camera: CameraModel, home: Path | None) -> Mapper:
-        made = Mapper(camera, self.config, self._matcher)
+        made = Mapper(camera, self.config, self._matcher, ProcessSolver())
         if home is not None:
             made.load(home)
         return made

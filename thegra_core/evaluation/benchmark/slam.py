@@ -38,7 +38,8 @@ _STILL = 1e-6
 class Plan:
     """What to run: every recording with every profile and the seeds 0 to runs - 1.
 
-    max_frames maps a recording's name (that of its folder or file) to the frames it is cut to. assignments are `key=value` parameters.
+    max_frames maps a recording's name (that of its folder or file) to the frames it is cut to. assignments are `key=value` parameters. realtime: each
+    recording is played at its own rate.
     """
 
     recordings: tuple[Path, ...]
@@ -48,6 +49,7 @@ class Plan:
     cache: Path | None = None
     max_frames: Mapping[str, int] = field(default_factory=dict)
     assignments: tuple[str, ...] = ()
+    realtime: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +135,7 @@ def command(run: PlannedRun, plan: Plan) -> list[str]:
     """The command line of a run."""
     options = [run.recording, "--profile", run.profile, "--seed", run.seed, "--out", run.folder, "--quiet"]
     options += ["--max-frames", run.max_frames] if run.max_frames is not None else []
+    options += ["--realtime"] if plan.realtime else []
     options += ["--cache", plan.cache] if plan.cache is not None else []
     options += [word for assignment in plan.assignments for word in ("--set", assignment)]
     return [sys.executable, "-m", "thegra_core.cli.main", "run", *map(str, options)]
@@ -159,6 +162,10 @@ def figures_of(run: PlannedRun) -> dict[str, Any]:
         "extent": max((_diagonal(t.positions) for t in trajectories), default=0.0),
         "s_per_frame": {p: None if ms[p] is None else round(ms[p] / 1e3, 4) for p in ("p50", "p95")},
         "fps": metrics.get("fps"),
+        "ms": metrics.get("ms", {}),
+        "latency_ms": metrics.get("latency_ms"),
+        "dropped_frames": metrics.get("dropped_frames", 0),
+        "cpu_s_per_frame": metrics.get("cpu_s_per_frame"),
         "ms_stages": {stage: values["p50"] for stage, values in metrics.get("ms", {}).items()},
     }
     return figures | _scores(run, metrics)

@@ -1,0 +1,224 @@
+"""Following points from image to image, on pictures whose motion is known."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from thegra_core.config import FlowConfig
+from thegra_core.features.flow import coarse_shift, follow, normalize_contrast, patch_similarity
+from thegra_core.features.front_end import DetectAndFollow, DetectEach, merged
+from thegra_core.features.protocols import Wanted
+from thegra_core.features.tracks import TrackMatcher, shared_tracks
+from thegra_core.messages import Features, Matches
+
+WIDTH, HEIGHT = 320, 256
+CONFIG = FlowConfig()
+
+
+def texture(seed: int = 0) -> np.ndarray:
+    """Smooth random blobs, larger than the image."""
+    noise = np.random.default_rng(seed).normal(size=(HEIGHT + 128, WIDTH + 128)).astype(np.float32)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def view(picture: np.ndarray, dx: float, dy: float, turn_deg: float = 0.0, gain: float = 1.0, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """The part of the picture that a camera moved by (dx, dy) px and turned sees, and the (2, 3) map from picture to image."""
+    matrix = cv2.getRotationMatrix2D(((WIDTH + 128) / 2, (HEIGHT + 128) / 2), turn_deg, 1.0)
+    matrix[:, 2] -= [64 + dx, 64 + dy]
+    seen = cv2.warpAffine(picture, matrix, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR)
+    return np.clip(gain * seen.astype(np.float32) + offset, 0, 255).astype(np.uint8), matrix
+
+
+def grid(step: int = 20, margin: int = 60) -> np.ndarray:
+    y, x = np.mgrid[margin : HEIGHT - margin : step, margin : WIDTH - margin : step]
+    return np.stack((x.ravel(), y.ravel()), axis=1).astype(np.float32)
+
+
+def moved(points: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Where points of one image lie in another one of the same picture."""
+    whole_before, whole_after = (np.vstack((m, [0, 0, 1])) for m in (before, after))
+    mapped = np.column_stack((points, np.ones(len(points)))) @ (whole_after @ np.linalg.inv(whole_before)).T
+    return mapped[:, :2]
+
+
+@pytest.mark.parametrize(("dx", "dy", "turn_deg"), [(0, 0, 0), (3.4, -2.2, 0), (31, 18, 0), (-40, 25, 2), (4, 2, 6)])
+def test_points_are_found_where_they_went(dx: float, dy: float, turn_deg: float) -> None:
+    picture = texture()
+    (first, at_first), (second, at_second) = view(picture, 0, 0), view(picture, dx, dy, turn_deg)
+    first, second, points = normalize_contrast(first), normalize_contrast(second), grid()
+    result = follow(first, second, points, points + coarse_shift(first, second), CONFIG)
+    error = np.linalg.norm(result.points - moved(points, at_first, at_second), axis=1)
+    assert result.found.mean() > 0.9
+    assert np.median(error[result.found]) < 0.1 + 0.03 * abs(turn_deg) and error[result.found].max() < 1.5
+    assert result.similarity[result.found].min() >= CONFIG.min_similarity
+
+
+def test_gain_control_is_no_motion() -> None:
+    picture = texture()
+    (first, _), (second, _) = view(picture, 0, 0, gain=0.3, offset=30), view(picture, 5, 3, gain=0.6, offset=80)
+    first, second, points = normalize_contrast(first), normalize_contrast(second), grid()
+    result = follow(first, second, points, points, CONFIG)
+    error = np.linalg.norm(result.points - (points - [5, 3]), axis=1)
+    assert result.found.mean() > 0.9 and np.percentile(error[result.found], 95) < 0.25
+
+
+def test_little_is_found_in_another_picture() -> None:
+    first, second, points = normalize_contrast(view(texture(0), 0, 0)[0]), normalize_contrast(view(texture(1), 0, 0)[0]), grid()
+    assert follow(first, second, points, points, CONFIG).found.mean() < 0.2
+
+
+def test_points_that_leave_the_image_are_lost() -> None:
+    picture = texture()
+    first, second = (normalize_contrast(view(picture, dx, 0)[0]) for dx in (0, 30))
+    points = np.array([[10, 100], [200, 100]], np.float32)
+    assert follow(first, second, points, points - [30, 0], CONFIG).found.tolist() == [False, True]
+
+
+def test_no_points_are_no_trouble() -> None:
+    image = normalize_contrast(view(texture(), 0, 0)[0])
+    result = follow(image, image, np.empty((0, 2), np.float32), np.empty((0, 2), np.float32), CONFIG)
+    assert result.points.shape == (0, 2) and len(result.found) == len(result.similarity) == 0
+
+
+def test_similarity_knows_neither_brightness_nor_contrast() -> None:
+    image = view(texture(), 0, 0)[0]
+    darker, inverted = (0.4 * image + 20).astype(np.uint8), 255 - image
+    points = grid()
+    assert patch_similarity(image, darker, points, points, 9).min() > 0.95
+    assert patch_similarity(image, inverted, points, points, 9).max() < -0.99
+
+
+# ---- the front ends ---------------------------------------------------------------------------------------------------------------
+
+
+class Corners:
+    """Corners of the image, each with a descriptor of its place and of how often was detected."""
+
+    name = "corners"
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def extract(self, image: np.ndarray, stamp_ns: int) -> Features:
+        self.calls += 1
+        found = cv2.goodFeaturesToTrack(image, 150, 0.01, 8)
+        points = np.empty((0, 2), np.float32) if found is None else found[:, 0].astype(np.float32)
+        descriptors = np.column_stack((points, np.full(len(points), self.calls))).astype(np.float32)
+        return Features(stamp_ns, points, np.full(len(points), 0.8, np.float32), descriptors, (image.shape[1], image.shape[0]), self.name)
+
+
+def front_end() -> tuple[DetectAndFollow, Corners]:
+    corners = Corners()
+    return DetectAndFollow(corners, CONFIG, 200), corners
+
+
+def test_one_detection_serves_many_images() -> None:
+    picture, (end, corners) = texture(), front_end()
+    assert end.follow(view(picture, 0, 0)[0], 0) is None
+    first = end.detect()
+    for i in range(1, 8):
+        followed = end.follow(view(picture, 3 * i, i)[0], i)
+        assert followed is not None and followed.stamp_ns == i
+    assert corners.calls == 1
+    pairs = shared_tracks(followed, first)
+    assert len(pairs) == len(followed) > 0.6 * len(first)
+    there = first.keypoints[pairs.indices[:, 1]] - [21, 7]
+    assert np.median(np.linalg.norm(followed.keypoints[pairs.indices[:, 0]] - there, axis=1)) < 0.2
+    np.testing.assert_array_equal(followed.descriptors[pairs.indices[:, 0]], first.descriptors[pairs.indices[:, 1]])
+    assert (followed.scores <= 0.8).all() and (followed.scores > 0).all()
+
+
+def test_detecting_more_keeps_the_tracks_where_they_are() -> None:
+    picture, (end, corners) = texture(), front_end()
+    end.follow(view(picture, 0, 0)[0], 0)
+    end.detect()
+    followed = end.follow(view(picture, 30, 0)[0], 1)
+    assert followed is not None
+    more = end.detect(Wanted.MORE)
+    pairs = shared_tracks(more, followed)
+    assert len(pairs) == len(followed) < len(more) and corners.calls == 2
+    np.testing.assert_array_equal(more.keypoints[pairs.indices[:, 0]], followed.keypoints[pairs.indices[:, 1]])
+    new = np.setdiff1d(np.arange(len(more)), pairs.indices[:, 0])
+    assert len(set(more.track_ids.tolist())) == len(more)
+    assert (more.descriptors[new, 2] == 2).all(), "what is new comes from this image"
+    distance = np.linalg.norm(more.keypoints[new][:, None] - followed.keypoints[None], axis=2).min(axis=1)
+    assert (distance > CONFIG.near_px).all()
+
+
+def test_detecting_anew_forgets_the_tracks() -> None:
+    picture, (end, _) = texture(), front_end()
+    end.follow(view(picture, 0, 0)[0], 0)
+    first = end.detect()
+    end.follow(view(picture, 2, 0)[0], 1)
+    assert len(shared_tracks(end.detect(Wanted.ANEW), first)) == 0
+
+
+def test_another_scene_is_not_followed() -> None:
+    end, corners = front_end()
+    end.follow(view(texture(0), 0, 0)[0], 0)
+    end.detect()
+    assert end.follow(view(texture(1), 0, 0)[0], 1) is None
+    assert len(end.detect()) > 50 and corners.calls == 2
+
+
+def test_a_forgotten_image_is_not_followed_from() -> None:
+    picture, (end, _) = texture(), front_end()
+    end.follow(view(picture, 0, 0)[0], 0)
+    first = end.detect()
+    end.forget()
+    assert end.follow(view(picture, 1, 0)[0], 1) is None
+    assert len(shared_tracks(end.detect(), first)) == 0
+
+
+def test_images_without_contrast_are_survived() -> None:
+    end, _ = front_end()
+    for i in range(3):
+        assert end.follow(np.full((HEIGHT, WIDTH), 90, np.uint8), i) is None
+        assert len(end.detect()) == 0
+
+
+def test_detecting_each_is_the_extractor_itself() -> None:
+    corners = Corners()
+    end, image = DetectEach(corners), view(texture(), 0, 0)[0]
+    assert end.follow(image, 5) is None
+    found = end.detect()
+    assert found.stamp_ns == 5 and found.track_ids is None and corners.calls == 1
+
+
+def features(count: int, ids: list[int] | None, stamp_ns: int = 0) -> Features:
+    points = np.random.default_rng(count).uniform(0, 200, (count, 2)).astype(np.float32)
+    return Features(
+        stamp_ns, points, np.ones(count, np.float32), np.zeros((count, 4), np.float32), (WIDTH, HEIGHT), "x", None if ids is None else np.array(ids, np.int64)
+    )  # fmt: skip
+
+
+class Learned:
+    name = "learned"
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def match(self, query: Features, reference: Features) -> Matches:
+        self.asked += 1
+        return Matches(query.stamp_ns, reference.stamp_ns, np.empty((0, 2), np.int32), np.empty(0, np.float32))
+
+    def match_many(self, query: Features, references: list[Features]) -> list[Matches]:
+        return [self.match(query, r) for r in references]
+
+
+def test_tracks_are_matches_where_they_are_enough() -> None:
+    learned = Learned()
+    matcher = TrackMatcher(learned, 3)
+    query, near, far, plain = features(4, [7, 5, 9, 2], 1), features(5, [9, 1, 2, 7, 0], 2), features(3, [9, 20, 21], 3), features(4, None, 4)
+    found = matcher.match(query, near)
+    assert found.indices.tolist() == [[0, 3], [2, 0], [3, 2]] and (found.stamp_ns, found.reference_stamp_ns) == (1, 2)
+    assert learned.asked == 0
+    assert [len(m) for m in matcher.match_many(query, [near, far, plain])] == [3, 0, 0]
+    assert learned.asked == 2
+
+
+def test_there_are_never_more_keypoints_than_allowed() -> None:
+    assert len(merged(features(30, list(range(30))), features(40, None), 0.5, 50)) == 50
+    assert len(merged(features(60, list(range(60))), features(40, None), 0.5, 50)) == 60, "what is followed is kept"

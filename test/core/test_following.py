@@ -1,0 +1,237 @@
+"""The whole system with keypoints that are followed, and with mapping in a process of its own; the front end is a made world that numbers its points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import CAMERA, FakeExtractor, FakeMatcher, World, cloud, look, observe, sideways, stamp
+from test_slam import CONFIG, ate, frames
+
+from thegra_core.config import FlowConfig, ThegraConfig
+from thegra_core.errors import MappingError, WeightsError
+from thegra_core.features.protocols import Wanted
+from thegra_core.features.tracks import TrackMatcher
+from thegra_core.mapping.process import MappingProcess
+from thegra_core.messages import Features, Run, TrackingResult, TrackingState
+from thegra_core.slam import Slam
+
+FOLLOWING = CONFIG.model_copy(update={"flow": FlowConfig(enabled=True)})
+WALK = sideways(60, 0.025)
+
+
+def world() -> World:
+    return cloud(count=900, seed=1, low=(-4, -3, 3), high=(7, 3, 8))
+
+
+def fake_matcher(config: ThegraConfig) -> TrackMatcher:
+    """What a process of mapping builds."""
+    return TrackMatcher(FakeMatcher(), config.flow.min_shared)
+
+
+def no_weights(config: ThegraConfig) -> TrackMatcher:
+    raise WeightsError("there are no weights of the fake matcher")
+
+
+class WorldFrontEnd:
+    """Detects 400 points of a world and follows them exactly as far as they stay in view; the numbers of tracks are new with each detection anew."""
+
+    def __init__(self, of: World, path: dict[int, np.ndarray], noise_px: float = 0.2) -> None:
+        self.world, self.path, self.noise_px = of, path, noise_px
+        self.known: dict[int, int] = {}  # point -> track
+        self.last = 0
+        self.next = 0
+        self.asked: list[Wanted] = []
+        self.misled = False
+
+    def seen(self) -> tuple[Features, np.ndarray]:
+        found = observe(self.world, self.path[self.last], self.last, self.noise_px)
+        return found, (found.descriptors @ self.world.descriptors.T).argmax(axis=1)
+
+    def follow(self, image: np.ndarray, stamp_ns: int) -> Features | None:
+        self.last = stamp_ns
+        if not self.known:
+            return None
+        found, points = self.seen()
+        kept = np.flatnonzero(np.isin(points, list(self.known)))
+        self.known = {p: self.known[p] for p in points[kept].tolist()}
+        if len(kept) < 80:
+            return None
+        keypoints = found.keypoints[kept] + (np.random.default_rng(1).uniform(-40, 40, (len(kept), 2)).astype(np.float32) if self.misled else 0)
+        return self._pick(found, kept, keypoints, [self.known[p] for p in points[kept].tolist()])
+
+    def detect(self, wanted: Wanted = Wanted.MORE) -> Features:
+        self.asked.append(wanted)
+        found, points = self.seen()
+        if wanted is Wanted.ANEW:
+            self.known = {}
+        old = np.flatnonzero(np.isin(points, list(self.known)))
+        new = np.flatnonzero(~np.isin(points, list(self.known)))[: max(400 - len(old), 0)]
+        for point in points[new].tolist():
+            self.known[point], self.next = self.next, self.next + 1
+        rows = np.concatenate((old, new))
+        return self._pick(found, rows, found.keypoints[rows], [self.known[p] for p in points[rows].tolist()])
+
+    def forget(self) -> None:
+        self.known = {}
+
+    @staticmethod
+    def _pick(found: Features, rows: np.ndarray, keypoints: np.ndarray, ids: list[int]) -> Features:
+        return replace(found, keypoints=keypoints, scores=found.scores[rows], descriptors=found.descriptors[rows], track_ids=np.array(ids, np.int64))
+
+
+def make(path: list[np.ndarray], config: ThegraConfig = FOLLOWING) -> tuple[Slam, WorldFrontEnd, FakeMatcher]:
+    by_stamp = {stamp(i): pose for i, pose in enumerate(path)}
+    matcher = FakeMatcher()
+    slam = Slam(CAMERA, config, FakeExtractor(world(), by_stamp), matcher)
+    slam._front_end = end = WorldFrontEnd(world(), by_stamp)
+    return slam, end, matcher
+
+
+def play(slam: Slam, count: int, begin: int = 0) -> list[TrackingResult]:
+    return [slam.process(frame) for frame in frames(count, begin)]
+
+
+@pytest.fixture(scope="module")
+def walked() -> tuple[list[TrackingResult], Run, WorldFrontEnd, FakeMatcher]:
+    slam, end, matcher = make(WALK)
+    results = play(slam, 60)
+    return results, slam.finish(), end, matcher
+
+
+def test_followed_points_carry_the_camera_along(walked: tuple[list[TrackingResult], Run, WorldFrontEnd, FakeMatcher]) -> None:
+    results, run, end, _ = walked
+    error, placed = ate(run, WALK)
+    assert error < 0.003 and placed == 60
+    assert (run.losses, len(run.maps)) == (0, 1)
+    keyframes = sum(r.is_keyframe for r in results)
+    assert 3 < len(end.asked) < 30, "most frames are followed"
+    assert len(end.asked) <= keyframes + 3 and Wanted.ANEW not in end.asked
+    live, _ = ate(run, WALK, live=True)
+    assert live < 0.01
+
+
+def test_matches_come_from_the_tracks(walked: tuple[list[TrackingResult], Run, WorldFrontEnd, FakeMatcher]) -> None:
+    _, run, _, matcher = walked
+    assert len(run.maps[0].keyframe_poses) > 5
+    assert matcher.calls < 0.5 * len(run.maps[0].keyframe_poses), "keyframes share tracks with their neighbours"
+
+
+def test_the_same_frames_give_the_same_bytes() -> None:
+    runs = []
+    for _ in range(2):
+        slam, _, _ = make(WALK)
+        play(slam, 30)
+        runs.append([None if f.world_from_camera is None else f.world_from_camera.tobytes() for f in slam.finish().frames])
+    assert runs[0] == runs[1]
+
+
+def test_where_following_misleads_the_frame_is_matched_anew() -> None:
+    slam, end, _ = make(WALK)
+    play(slam, 25)
+    end.misled, before = True, len(end.asked)
+    result = play(slam, 1, 25)[0]
+    end.misled = False
+    assert result.state is TrackingState.TRACKING and end.asked[before:] == [Wanted.ANEW]
+    assert all(r.state is TrackingState.TRACKING for r in play(slam, 15, 26))
+    assert slam.finish().losses == 0
+
+
+def test_a_closure_is_not_followed_through() -> None:
+    slam, end, _ = make(WALK)
+    play(slam, 25)
+    image = frames(1, 25)[0].image
+    held = [slam.process(replace(frame, image=image)) for frame in frames(4, 25)]
+    assert held[-1].state is TrackingState.HOLD and not end.known
+    assert play(slam, 1, 29)[0].state is TrackingState.TRACKING
+    assert slam.finish().losses == 0
+
+
+def test_a_camera_that_only_turns_claims_nothing() -> None:
+    turning = [look([0, 0, 0], 0.8 * i, 0.1 * i) for i in range(40)]
+    slam, _, _ = make(turning)
+    assert all(r.world_from_camera is None for r in play(slam, 40))
+    assert slam.finish().maps == ()
+
+
+# ---- mapping in a process of its own ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def beside() -> Iterator[Slam]:
+    slam, _, _ = make(WALK)
+    slam._mapping = MappingProcess(CAMERA, FOLLOWING, fake_matcher)
+    slam.usage()  # it is ready
+    yield slam
+    slam.close()
+
+
+def process_all(slam: Slam, count: int, begin: int = 0) -> list[TrackingResult]:
+    """Frames that come slowly: mapping has done everything before the next one."""
+    results = []
+    for frame in frames(count, begin):
+        results.append(slam.process(frame))
+        slam.usage()
+    return results
+
+
+def test_a_process_of_its_own_maps_as_well(beside: Slam) -> None:
+    process_all(beside, 60)
+    run = beside.finish()
+    error, placed = ate(run, WALK)
+    assert error < 0.004 and placed == 60
+    assert (run.losses, len(run.maps)) == (0, 1) and len(run.maps[0].keyframe_poses) > 5
+    used = beside.usage()
+    assert used.cpu_s > 0 and used.peak_rss_mb > 50
+
+
+def test_tracking_goes_on_while_mapping_is_behind(beside: Slam) -> None:
+    process_all(beside, 25)
+    held_back = beside._mapping.updates
+    beside._mapping.updates = list  # type: ignore[method-assign]
+    results = play(beside, 20, 25)
+    assert all(r.state is TrackingState.TRACKING for r in results)
+    assert sum(r.is_keyframe for r in results) == FOLLOWING.keyframe.most_pending
+    beside._mapping.updates = held_back  # type: ignore[method-assign]
+    beside.usage()
+    assert any(r.is_keyframe for r in process_all(beside, 10, 45))
+    error, _ = ate(beside.finish(), WALK)
+    assert error < 0.005
+
+
+def test_a_process_that_dies_is_reported(beside: Slam) -> None:
+    process_all(beside, 25)
+    beside._mapping._process.kill()  # type: ignore[attr-defined]
+    beside._mapping._process.wait()  # type: ignore[attr-defined]
+    with pytest.raises(MappingError, match=r"ended with code -9 \(killed; out of memory\?\)"):
+        play(beside, 20, 25)
+    run = beside.finish()
+    assert len(run.maps) == 1 and ate(run, WALK)[0] < 0.01, "what tracking knows of the map is kept"
+
+
+def test_an_error_in_the_process_is_told(beside: Slam) -> None:
+    process_all(beside, 25)
+    beside._mapping._tell("insert", "not a keyframe")  # type: ignore[attr-defined]
+    with pytest.raises(MappingError, match="AttributeError"):
+        beside.usage()
+
+
+def test_missing_weights_are_told_as_such() -> None:
+    mapping = MappingProcess(CAMERA, FOLLOWING, no_weights)
+    with pytest.raises(WeightsError, match="no weights of the fake matcher"):
+        mapping.usage()
+    mapping.close()
+    assert mapping._process.returncode is not None
+
+
+def test_a_map_can_be_saved_and_read_in_a_process(beside: Slam, tmp_path) -> None:
+    process_all(beside, 30)
+    beside.save_map(tmp_path / "kept.map")
+    slam, _, _ = make(WALK)
+    slam._mapping = MappingProcess(CAMERA, FOLLOWING, fake_matcher)
+    slam.load_map(tmp_path / "kept.map")
+    results = process_all(slam, 10, 25)
+    slam.close()
+    assert all(r.state is TrackingState.TRACKING for r in results)

@@ -1,0 +1,116 @@
+"""Recordings played at their own rate, with every profile: how long a pose takes, what is dropped, and what that costs in accuracy."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from thegra_core.evaluation.benchmark.slam import Plan, PlannedRun, RunResult, execute, planned_runs, write_report
+from thegra_core.evaluation.suite import make_recording
+from thegra_core.simulation.simulate import SimulationOptions
+from thegra_core.version import VERSION
+
+HEADER = (
+    "recording", "profile", "dropped %", "latency ms p50 / p95 / p99", "CPU s/frame", "frame ms p50 / p95 / p99", "stages ms p50 / p95 / p99", "tracked %",
+    "offline", "ATE", "live ATE", "offline ATE", "peak MB",
+)  # fmt: skip
+SEED = 7
+"""Of the simulated recordings."""
+_SHOWN_MS = 1.0
+
+
+def simulated(folder: Path, sizes: Sequence[tuple[int, int]], rates: Sequence[float], duration_s: float, say: Callable[[str, int, int], None]) -> list[Path]:
+    """The same walk through the same room, seen in each size (width, height) px at each rate (Hz); what is missing in `folder` is simulated.
+
+    Raises:
+        InputError: As `make_recording`.
+    """
+    made = []
+    for width, height in sizes:
+        for rate in rates:
+            options = SimulationOptions.model_validate(
+                {"scene": "room", "style": "robust", "shutter": "freeze", "seed": SEED, "duration_s": duration_s, "rate_hz": rate, "image_size": (width, height)}
+            )
+            made.append(make_recording(folder / f"room_{width}x{height}_{rate:g}hz_{duration_s:g}s", options, say))
+    return made
+
+
+def benchmark(
+    recordings: Sequence[Path], profiles: Sequence[str], out: Path, offline: bool, assignments: tuple[str, ...], say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Run everything, one at a time, and write `results.json` and `results.md`; returns what the former holds.
+
+    Raises:
+        ThegraError: As `planned_runs`, before anything runs.
+    """
+    live = Plan(tuple(recordings), out / "live", tuple(profiles), assignments=assignments, realtime=True)
+    calm = Plan(tuple(recordings), out / "offline", tuple(profiles), assignments=assignments)
+    content: dict[str, Any] = {"version": VERSION, "machine": machine(), "assignments": list(assignments), "results": []}
+    for run, again in zip(planned_runs(live), planned_runs(calm), strict=True):
+        say(f"{run.name} {run.profile} at its own rate")
+        played = execute(run, live)
+        result: dict[str, Any] = {"recording": run.name, "profile": run.profile, "live": _figures(played), "offline": None, "failed": _failed(run, played)}
+        if offline:
+            say(f"{run.name} {run.profile} offline")
+            without_haste = execute(again, calm)
+            result |= {"offline": _figures(without_haste), "failed": [*_failed(run, played), *_failed(again, without_haste)]}
+        content["results"].append(result)
+        write_report(Plan((), out), content, markdown(content))
+    return content
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"platform": platform.platform(), "python": platform.python_version(), "processors": cores}
+
+
+def failures(content: Mapping[str, Any]) -> list[str]:
+    """One line for each run that failed."""
+    return [line for result in content["results"] for line in result["failed"]]
+
+
+def markdown(content: Mapping[str, Any]) -> str:
+    """A GitHub table, a line that explains it, and the failures."""
+    lines = [HEADER, ("---",) * len(HEADER), *(_row(r) for r in content["results"])]
+    text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
+    settings = f"With {', '.join(content['assignments'])}. " if content["assignments"] else ""
+    told = (
+        f"{settings}Latency: from the frame's delivery to its pose. Frame: the work on it. CPU: of all processes. Dropped frames count as not tracked. ATE: after Sim(3) "
+        f"alignment, of the finished map; live: as estimated at the time. "
+        f"Thegra {content['version']}, {content['machine']['processors']} processors, {content['machine']['platform']}."
+    )
+    return f"{text}\n{told}\n" + "".join(f"\nFailed: {line}\n" for line in failures(content))
+
+
+def _figures(result: RunResult) -> dict[str, Any] | None:
+    return dict(result.figures) if result.figures else None
+
+
+def _failed(run: PlannedRun, result: RunResult) -> list[str]:
+    how = "offline" if "offline" in run.folder.parts else "live"
+    return [] if result.error is None else [f"{run.name}, {run.profile}, {how} (exit code {result.exit_code}): {' '.join(result.error.split())}"]
+
+
+def _row(result: Mapping[str, Any]) -> tuple[str, ...]:
+    live, offline = result["live"], result["offline"]
+    if live is None:
+        return (result["recording"], result["profile"], "failed", *["–"] * (len(HEADER) - 3))
+    stages = {stage: ms for stage, ms in live["ms"].items() if stage != "total" and ms["p50"] is not None and ms["p95"] >= _SHOWN_MS}
+    return (
+        result["recording"], result["profile"], f"{100 * live['dropped_frames'] / max(live['frames_total'], 1):.1f}", _percentiles(live["latency_ms"]),
+        f"{live['cpu_s_per_frame']:.3f}", _percentiles(live["ms"].get("total")), ", ".join(f"{stage} {_percentiles(ms)}" for stage, ms in stages.items()) or "–",
+        f"{live['tracked_pct']:.1f}", f"{offline['tracked_pct']:.1f}" if offline else "–", _error(live, "ate_rmse"), _error(live, "ate_live_rmse"),
+        _error(offline, "ate_rmse"), f"{live['peak_rss_mb']:.0f}",
+    )  # fmt: skip
+
+
+def _percentiles(values: Mapping[str, float | None] | None) -> str:
+    return "–" if values is None or None in values.values() else " / ".join(f"{values[p]:.0f}" for p in ("p50", "p95", "p99"))
+
+
+def _error(figures: Mapping[str, Any] | None, key: str) -> str:
+    return "–" if figures is None or figures.get(key) is None else f"{figures[key]:.3g}"

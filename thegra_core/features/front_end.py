@@ -1,0 +1,138 @@
+"""From a stream of images to features: every image on its own, or detect on some and follow in between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from thegra_core.config import FlowConfig
+from thegra_core.features.flow import coarse_shift, follow, normalize_contrast
+from thegra_core.features.protocols import Extractor, Wanted
+from thegra_core.messages import Features
+
+Image = NDArray[np.uint8]
+
+
+class DetectEach:
+    """`FrontEnd` that detects in every image."""
+
+    def __init__(self, extractor: Extractor) -> None:
+        self._extractor = extractor
+        self._last: tuple[Image, int] | None = None
+
+    def follow(self, image: Image, stamp_ns: int) -> Features | None:
+        """See `FrontEnd.follow`; always None."""
+        self._last = image, stamp_ns
+        return None
+
+    def detect(self, wanted: Wanted = Wanted.MORE) -> Features:
+        """See `FrontEnd.detect`."""
+        assert self._last is not None
+        return self._extractor.extract(*self._last)
+
+    def forget(self) -> None:
+        """See `FrontEnd.forget`."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Trail:
+    """The last image as it was seen and normalized, and the points that are followed in it; `detected` counts those after the last detection."""
+
+    image: Image
+    normalized: Image
+    features: Features
+    detected: int
+
+
+class DetectAndFollow:
+    """`FrontEnd` that detects when it must or is told to, and follows these keypoints through the images between.
+
+    A keypoint keeps number, descriptor and the score of its detection, which falls with how its surroundings change. Detecting again keeps what is
+    followed where it is, with a descriptor of what is detected there, and adds what is detected elsewhere.
+    """
+
+    def __init__(self, extractor: Extractor, config: FlowConfig, max_keypoints: int) -> None:
+        self._extractor = extractor
+        self._config = config
+        self._max_keypoints = max_keypoints
+        self._trail: _Trail | None = None
+        self._next_id = 0
+
+    def follow(self, image: Image, stamp_ns: int) -> Features | None:
+        """See `FrontEnd.follow`."""
+        normalized, before = normalize_contrast(image), self._trail
+        if before is None or before.normalized.shape != image.shape:
+            self._trail = _Trail(image, normalized, _none(stamp_ns, image), 0)
+            return None
+        followed = self._followed(before, normalized, stamp_ns)
+        self._trail = _Trail(image, normalized, followed, before.detected)
+        return followed if len(followed) >= max(self._config.min_points, self._config.min_share * before.detected) else None
+
+    def detect(self, wanted: Wanted = Wanted.MORE) -> Features:
+        """See `FrontEnd.detect`."""
+        assert self._trail is not None
+        trail = self._trail
+        found = self._extractor.extract(trail.image, trail.features.stamp_ns)
+        if wanted is Wanted.MORE:
+            found = merged(trail.features, found, self._config.near_px, self._max_keypoints)
+        features = self._numbered(found)
+        self._trail = _Trail(trail.image, trail.normalized, features, len(features))
+        return features
+
+    def forget(self) -> None:
+        """See `FrontEnd.forget`."""
+        self._trail = None
+
+    def _followed(self, before: _Trail, normalized: Image, stamp_ns: int) -> Features:
+        points = before.features.keypoints
+        start = points + coarse_shift(before.normalized, normalized)
+        result = follow(before.normalized, normalized, points, start, self._config)
+        chosen = np.flatnonzero(result.found)
+        old = before.features
+        assert old.track_ids is not None
+        scores = old.scores[chosen] * result.similarity[chosen]
+        return Features(stamp_ns, result.points[chosen], scores, old.descriptors[chosen], old.image_size, old.extractor, old.track_ids[chosen], old.turns)
+
+    def _numbered(self, features: Features) -> Features:
+        """Give a number to each keypoint that has none."""
+        ids = np.full(len(features), -1, np.int64) if features.track_ids is None else features.track_ids.copy()
+        new = np.flatnonzero(ids < 0)
+        ids[new] = np.arange(self._next_id, self._next_id + len(new))
+        self._next_id += len(new)
+        return replace(features, track_ids=ids)
+
+
+def merged(followed: Features, detected: Features, near_px: float, most: int) -> Features:
+    """Followed keypoints with those detected farther than `near_px` from all of them, at most `most` in all; new ones have the number -1.
+
+    A followed keypoint takes descriptor and score of the nearest detected one that is near. Its place stays: it is what its track was measured at.
+    """
+    if len(followed) == 0 or len(detected) == 0:
+        return followed if len(detected) == 0 else detected
+    distance, nearest = cKDTree(detected.keypoints).query(followed.keypoints)
+    near = distance <= near_px
+    descriptors: NDArray[Any] = followed.descriptors.copy()
+    scores = followed.scores.copy()
+    descriptors[near], scores[near] = detected.descriptors[nearest[near]], detected.scores[nearest[near]]
+    away = np.flatnonzero(cKDTree(followed.keypoints).query(detected.keypoints)[0] > near_px)
+    new = away[: max(most - len(followed), 0)]
+    assert followed.track_ids is not None
+    return Features(
+        detected.stamp_ns,
+        np.concatenate((followed.keypoints, detected.keypoints[new])),
+        np.concatenate((scores, detected.scores[new])),
+        np.concatenate((descriptors, np.asarray(detected.descriptors[new], descriptors.dtype))),
+        detected.image_size,
+        detected.extractor,
+        np.concatenate((followed.track_ids, np.full(len(new), -1, np.int64))),
+        detected.turns,
+    )
+
+
+def _none(stamp_ns: int, image: Image) -> Features:
+    size = (image.shape[1], image.shape[0])
+    return Features(stamp_ns, np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty((0, 0), np.float32), size, "", np.empty(0, np.int64))

@@ -1,0 +1,38 @@
+"""Matching of keypoints that were followed: their numbers say what is the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from thegra_core.features.protocols import Matcher
+from thegra_core.messages import Features, Matches
+
+
+class TrackMatcher:
+    """`Matcher` that pairs keypoints by the number of their track where two frames share `min_shared` tracks, and asks another matcher where they do not."""
+
+    def __init__(self, matcher: Matcher, min_shared: int) -> None:
+        self.name = matcher.name
+        self._matcher = matcher
+        self._min_shared = min_shared
+
+    def match(self, query: Features, reference: Features) -> Matches:
+        """See `Matcher.match`."""
+        shared = shared_tracks(query, reference)
+        return shared if len(shared) >= self._min_shared else self._matcher.match(query, reference)
+
+    def match_many(self, query: Features, references: Sequence[Features]) -> list[Matches]:
+        """See `Matcher.match_many`."""
+        return [self.match(query, reference) for reference in references]
+
+
+def shared_tracks(query: Features, reference: Features) -> Matches:
+    """Keypoints of the same track; none where either has no tracks."""
+    if query.track_ids is None or reference.track_ids is None:
+        return Matches(query.stamp_ns, reference.stamp_ns, np.empty((0, 2), np.int32), np.empty(0, np.float32))
+    _, here, there = np.intersect1d(query.track_ids, reference.track_ids, assume_unique=True, return_indices=True)
+    order = np.argsort(here)
+    indices = np.stack((here[order], there[order]), axis=1).astype(np.int32)
+    return Matches(query.stamp_ns, reference.stamp_ns, indices, np.ones(len(indices), np.float32))

@@ -1,0 +1,233 @@
+"""Mapping in a process of its own, so that tracking never waits for it: bundle adjustment holds Python's global lock for a whole solve.
+
+One connection carries pickled messages both ways, in order. What tracking hands over is written by a thread, for the process reads nothing while it
+solves. The process ends when the connection does.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import socket
+import subprocess
+import sys
+import threading
+import traceback
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from thegra_core.config import ThegraConfig
+from thegra_core.errors import MappingError, ThegraError
+from thegra_core.features.protocols import Matcher
+from thegra_core.geometry.camera import CameraModel
+from thegra_core.map.map import Map
+from thegra_core.mapping.mapper import Mapper
+from thegra_core.mapping.service import InlineMapping
+from thegra_core.messages import InitialMap, Keyframe, MapUpdate
+from thegra_core.optimization.solver import ProcessSolver
+from thegra_core.process import Usage, keep_freed_memory, own_usage
+
+logger = logging.getLogger(__name__)
+LAST_WORDS_S = 5.0
+"""How long an ending process may take before it is killed."""
+NICENESS = 10
+"""Tracking goes first where cores are few."""
+_END = None
+_LAUNCH = f"import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); from {__name__} import main; main()"
+"""A terminal sends Ctrl-C to all processes, but it is meant for tracking, which tells when to end: it is ignored before anything else is imported."""
+MakeMatcher = Callable[[ThegraConfig], Matcher]
+"""Builds the matcher in the process; must be a function of a module, which is pickled by its name."""
+
+
+class MappingProcess:
+    """`MappingService` in a process of its own with one thread.
+
+    Raises:
+        WeightsError: If the matcher's weights are not there; from the first call that waits for an answer, or `updates`.
+    """
+
+    def __init__(self, camera: CameraModel, config: ThegraConfig, make_matcher: MakeMatcher) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            command = [sys.executable, "-c", _LAUNCH, str(theirs.fileno())]
+            environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment)
+        self._connection = Connection(ours.detach())
+        self._outbox: queue.SimpleQueue[tuple[str, tuple[Any, ...]] | None] = queue.SimpleQueue()
+        self._writer = threading.Thread(target=self._write, name="thegra mapping writer", daemon=True)
+        self._writer.start()
+        self._updates: list[MapUpdate] = []
+        self._submitted: deque[Future[Any]] = deque()
+        self._tell("begin", camera, config, make_matcher)
+
+    def initialize(self, initial: InitialMap) -> None:
+        """See `MappingService.initialize`."""
+        self._tell("initialize", initial)
+
+    def insert(self, keyframe: Keyframe) -> None:
+        """See `MappingService.insert`."""
+        self._tell("insert", keyframe)
+
+    def drop(self, map_id: int) -> None:
+        """See `MappingService.drop`."""
+        self._tell("drop", map_id)
+
+    def updates(self) -> list[MapUpdate]:
+        """See `MappingService.updates`."""
+        while self._readable():
+            self._take(self._receive())
+        taken, self._updates = self._updates, []
+        return taken
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """See `MappingService.submit`."""
+        self._submitted.append(Future())
+        self._tell("call", function, *arguments)
+        return self._submitted[-1]
+
+    def load(self, path: Path) -> MapUpdate:
+        """See `MappingService.load`."""
+        update: MapUpdate = self._ask("load", path)
+        return update
+
+    def save(self, path: Path) -> None:
+        """See `MappingService.save`."""
+        self._ask("save", path)
+
+    def finish(self) -> list[MapUpdate]:
+        """See `MappingService.finish`."""
+        last: list[MapUpdate] = self._ask("finish")
+        return [*self.updates(), *last]
+
+    def maps(self) -> list[Map]:
+        """See `MappingService.maps`."""
+        maps: list[Map] = self._ask("maps")
+        return maps
+
+    def counts(self) -> tuple[int, int]:
+        """See `MappingService.counts`."""
+        loops, merges = self._ask("counts")
+        return loops, merges
+
+    def usage(self) -> Usage:
+        """See `MappingService.usage`."""
+        usage: Usage = self._ask("usage")
+        return usage
+
+    def close(self) -> None:
+        """See `MappingService.close`."""
+        if self._connection.closed:
+            return
+        self._outbox.put(_END)
+        self._process.terminate()
+        try:
+            self._process.wait(LAST_WORDS_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._writer.join()
+        self._connection.close()
+
+    # ---- steps ----------------------------------------------------------------------------------------------------------------------
+
+    def _tell(self, name: str, *arguments: Any) -> None:
+        self._outbox.put((name, arguments))
+
+    def _ask(self, name: str, *arguments: Any) -> Any:
+        self._tell(name, *arguments)
+        while True:
+            kind, content = self._receive()
+            if kind == "answer":
+                return content
+            if kind == "refusal":
+                raise content
+            self._take((kind, content))
+
+    def _take(self, message: tuple[str, Any]) -> None:
+        kind, content = message
+        if kind == "failed":
+            if isinstance(content, ThegraError):
+                raise content
+            raise MappingError(f"the process of the mapping stage has failed:\n{content}")
+        if kind == "result":
+            self._submitted.popleft().set_result(content)
+            return
+        self._updates.extend(content)
+
+    def _readable(self) -> bool:
+        try:
+            return self._connection.poll()
+        except OSError as error:
+            raise MappingError(self._epitaph()) from error
+
+    def _receive(self) -> tuple[str, Any]:
+        try:
+            message: tuple[str, Any] = self._connection.recv()
+        except (EOFError, OSError) as error:
+            raise MappingError(self._epitaph()) from error
+        return message
+
+    def _epitaph(self) -> str:
+        try:
+            code: int | None = self._process.wait(LAST_WORDS_S)
+        except subprocess.TimeoutExpired:
+            code = None
+        killed = " (killed; out of memory?)" if code == -9 else ""
+        return f"the process of the mapping stage has ended with code {code}{killed}"
+
+    def _write(self) -> None:
+        while (message := self._outbox.get()) is not _END:
+            try:
+                self._connection.send(message)
+            except OSError:  # it has ended; who reads is told
+                return
+
+
+def serve(connection: Connection) -> None:
+    """Do what comes over the connection, in order, until it ends."""
+    mapping: InlineMapping | None = None
+    while True:
+        try:
+            name, arguments = connection.recv()
+        except (EOFError, OSError):
+            return
+        try:
+            if name == "begin":
+                camera, config, make_matcher = arguments
+                mapping = InlineMapping(Mapper(camera, config, make_matcher(config), ProcessSolver()))
+                continue
+            assert mapping is not None
+            answer = _do(mapping, name, arguments)
+        except Exception as error:
+            connection.send(("failed", error if isinstance(error, ThegraError) else traceback.format_exc()))
+            return
+        if answer is not None:
+            connection.send(answer)
+
+
+def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...]) -> tuple[str, Any] | None:
+    if name in ("initialize", "insert", "drop"):
+        getattr(mapping, name)(*arguments)
+        return "updates", mapping.updates()
+    if name == "call":
+        function, *rest = arguments
+        return "result", function(*rest)
+    if name == "usage":
+        return "answer", own_usage()
+    try:
+        return "answer", getattr(mapping, name)(*arguments)
+    except ThegraError as error:
+        return "refusal", error
+
+
+def main() -> None:
+    """The process: its argument is the file descriptor of the connection."""
+    os.nice(NICENESS)
+    logging.basicConfig(level=logging.WARNING, format="[thegra mapping] %(levelname)s %(message)s")
+    keep_freed_memory()
+    serve(Connection(int(sys.argv[1])))
