@@ -149,7 +149,7 @@ def test_another_epoch_begins_a_new_map(monkeypatch: pytest.MonkeyPatch) -> None
     made: list[object] = []
 
     class FakeSlam:
-        def __init__(self, camera, config, *networks, keep_records=True) -> None:
+        def __init__(self, camera, config, *networks, keep_records=True, **others) -> None:
             assert not keep_records, 'a live stream has no end'
             made.append(networks)
 
@@ -157,6 +157,9 @@ def test_another_epoch_begins_a_new_map(monkeypatch: pytest.MonkeyPatch) -> None
             if frame.index == 9:
                 raise ZeroDivisionError
             return TrackingResult(frame.stamp_ns, TrackingState.INITIALIZING)
+
+        def close(self) -> None:
+            pass
 
     monkeypatch.setattr("thegra_core.slam.Slam", FakeSlam)
     engine = LocalEngine(load_config("fast", overrides={"extractor.name": "orb"}))
