@@ -157,6 +157,7 @@ class LocalEngine:
         return f"the map is in {path}"
 
     def _begin_in(self, order: BeginIn) -> str:
+        self._epoch = order.epoch  # also where it cannot be: the frames to come are then in the map that is there
         self._replace(self._new(order.camera, order.path), order.epoch)
         return f"the camera is sought in the map of {order.path}"
 

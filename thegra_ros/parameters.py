@@ -1,6 +1,6 @@
 """The configuration model as ROS parameters: dotted names, ranges, units and texts come from the model.
 
-`preprocessing.filters`, a list of sections, is one parameter of YAML text. Parameters that may be none are texts: `none` or a number.
+A list is one parameter of YAML text. Parameters that may be none are texts: `none` or a number.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def to_ros(value: Any) -> Any:
     if value is None:
         return "none"
     if isinstance(value, tuple):
-        return yaml.safe_dump([item.model_dump(mode="json") for item in value], default_flow_style=True, width=10**6, sort_keys=False).strip()
+        return yaml.safe_dump([item.model_dump(mode="json") if isinstance(item, BaseModel) else item for item in value], default_flow_style=True, width=10**6, sort_keys=False).strip()
     return value
 
 
@@ -72,7 +72,8 @@ def from_ros(values: Mapping[str, Any], defaults: ThegraConfig) -> ThegraConfig:
         node = tree
         for section in sections:
             node = node[section]
-        node[last] = _filters(value) if name == "preprocessing.filters" else None if value == "none" and not isinstance(node[last], str) else value
+        listed = isinstance(node[last], tuple | list)
+        node[last] = _items(name, value) if listed else None if value == "none" and not isinstance(node[last], str) else value
     return validated(ThegraConfig, tree)
 
 
@@ -132,13 +133,16 @@ def load_defaults(node: Node) -> ThegraConfig:
     return load_config(values["profile"] or None, Path(values["config_file"]).expanduser() if values["config_file"] else None)
 
 
-def _filters(text: str) -> Any:
-    """A YAML list of filters, or their names alone with commas between them."""
+def _items(name: str, text: str) -> tuple[Any, ...]:
+    """A YAML list, or its items alone with commas between them; of filters their names will do."""
     try:
         values = yaml.safe_load(text)
+        if isinstance(values, str):
+            values = [yaml.safe_load(part) for part in values.split(",")]
     except yaml.YAMLError as error:
-        raise ConfigError(f"preprocessing.filters is no YAML: {error}") from error
-    return [{"filter": name.strip()} for name in values.split(",")] if isinstance(values, str) else values
+        raise ConfigError(f"{name} is no YAML: {error}") from error
+    items = values if isinstance(values, list) else [] if values is None else [values]
+    return tuple({"filter": item} if name == "preprocessing.filters" and isinstance(item, str) else item for item in items)
 
 
 def _kind(field: FieldInfo) -> int:
@@ -172,5 +176,6 @@ def _constraints(field: FieldInfo, exclusive: list[str]) -> str:
     if origin in (types.UnionType, typing.Union):
         return "a number or none"
     if origin is tuple:
-        return "names with commas, or a YAML list of {filter: NAME, PARAMETER: VALUE, ...}"
+        of_filters = typing.get_origin(typing.get_args(annotation)[0]) is not Literal
+        return "names with commas, or a YAML list of {filter: NAME, PARAMETER: VALUE, ...}" if of_filters else "a YAML list, or its items with commas"
     return ", ".join(exclusive)

@@ -57,6 +57,15 @@ def test_values_that_may_be_none_and_filters_are_texts() -> None:
     assert from_ros({"preprocessing.filters": "[{filter: median, size: 5}]"}, defaults).preprocessing.filters == (Median(size=5),)
 
 
+def test_lists_are_texts() -> None:
+    values = {p.name: p.value for p in declared(load_config("quality"))}
+    assert values["loop.rotations"] == "[270, 90, 180]"
+    for text, wanted in (("[90, 270]", (90, 270)), ("90, 270", (90, 270)), ("90", (90,)), ("[]", ()), ("", ())):
+        assert from_ros({"loop.rotations": text}, load_config("quality")).loop.rotations == wanted
+    with pytest.raises(ConfigError, match=r"loop\.rotations"):
+        from_ros({"loop.rotations": "[45]"}, load_config("quality"))
+
+
 @pytest.mark.parametrize(("name", "value"), [("tracking.max_view_angle_deg", 180.0), ("extractor.nms_radius", "many"), ("preprocessing.filters", "sharpen"), ("preprocessing.filters", "[{"), ("weighting", "half")])
 def test_what_the_model_refuses_is_named(name: str, value: object) -> None:
     with pytest.raises(ConfigError, match=name.replace(".", r"\.")):

@@ -7,6 +7,7 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ros]")
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,8 @@ from thegra_ros.transforms import Frames, map_pose
 def test_the_trajectory_is_that_of_one_process(graph: Graph, shared_data: Path, name: str, count: int) -> None:
     """No frame dropped: each is sent when the one before is done. Within 1 % of the path's length, frame by frame."""
     recording = open_recording(shared_data / name)
-    frames, camera = list(itertools.islice(recording.frames(), count)), camera_for(recording, None)
+    frames = [replace(f, stamp_ns=f.stamp_ns + 1000 * 10**9) for f in itertools.islice(recording.frames(), count)]  # some begin at zero
+    camera = camera_for(recording, None)
     slam = Slam(camera, load_config("fast", overrides=OFFLINE))
     alone = {r.stamp_ns: map_pose(r.world_from_camera, Frames()) for r in map(slam.process, frames) if r.state is TrackingState.TRACKING}
     stages = Stages(graph, camera, frames[0])

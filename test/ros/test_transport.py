@@ -68,12 +68,13 @@ def test_no_image_is_lost_between_two_processes_with_the_profile(graph: Graph, t
     for i in range(COUNT):
         assert cv2.imwrite(str(folder / f"{i:04d}.png"), rng.integers(7000, 7200, (512, 640), dtype=np.uint16), [cv2.IMWRITE_PNG_COMPRESSION, 0])
     (folder / "images.txt").write_text("".join(f"{1000 + i / RATE_HZ:.6f} {i:04d}.png\n" for i in range(COUNT)))
+    (folder / "camera.txt").write_text("400,400,320,256\n")
     graph.environment["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(config_file("fastdds.xml"))
     best_effort = {"qos_overrides./thegra/image_raw.subscription.reliability": "best_effort", "qos_overrides./thegra/image_raw.subscription.depth": "5"}
     graph.start("thegra_ros.nodes.preprocessing", best_effort)
     notices = graph.listen(DiagnosticArray, "shutter", LOSSLESS)
     graph.wait(lambda: bool(graph.received["/diagnostics"]), "the node")
-    command = [sys.executable, "-m", "thegra_core.cli.main", "play", str(folder), "--camera", "400,400,320,256", "--wait", str(LIMIT_S)]
+    command = [sys.executable, "-m", "thegra_core.cli.main", "play", str(folder), "--camera", str(folder / "camera.txt"), "--wait", str(LIMIT_S)]
     with subprocess.Popen(command, env=graph.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as play:
         graph.wait(lambda: play.poll() is not None, "the end of the recording")
     assert play.returncode == 0

@@ -13,7 +13,7 @@ from thegra_core.config import load_config
 from thegra_core.errors import InputError, WeightsError
 from thegra_core.messages import Frame, TrackingResult, TrackingState
 from thegra_core.simulation.cameras import thermal_camera
-from thegra_ros.engine import Done, EngineError, Job, LocalEngine, Order, SaveMap
+from thegra_ros.engine import BeginIn, Done, EngineError, Job, LocalEngine, Order, SaveMap
 from thegra_ros.image_slot import MOST_BYTES, make_slot, put, take
 from thegra_ros.worker import MOST_FAILURES, NotWorkingError, Worker
 
@@ -149,7 +149,7 @@ def test_another_epoch_begins_a_new_map(monkeypatch: pytest.MonkeyPatch) -> None
     made: list[object] = []
 
     class FakeSlam:
-        def __init__(self, camera, config, *networks, keep_records=True) -> None:
+        def __init__(self, camera, config, *networks, keep_records=True, **others) -> None:
             assert not keep_records, 'a live stream has no end'
             made.append(networks)
 
@@ -157,6 +157,9 @@ def test_another_epoch_begins_a_new_map(monkeypatch: pytest.MonkeyPatch) -> None
             if frame.index == 9:
                 raise ZeroDivisionError
             return TrackingResult(frame.stamp_ns, TrackingState.INITIALIZING)
+
+        def close(self) -> None:
+            pass
 
     monkeypatch.setattr("thegra_core.slam.Slam", FakeSlam)
     engine = LocalEngine(load_config("fast", overrides={"extractor.name": "orb"}))
@@ -186,3 +189,29 @@ def test_an_image_without_room_in_the_slot_goes_as_it_is() -> None:
     slot = make_slot(multiprocessing.get_context("spawn"))
     large = Frame(2, 5, np.zeros((MOST_BYTES // 1000 + 1, 1000), np.uint8))
     assert put(slot, large) is large and take(slot, large) is large
+
+
+def test_a_map_that_cannot_be_loaded_leaves_the_one_that_is_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    made: list[object] = []
+
+    class FakeSlam:
+        def __init__(self, *arguments, **options) -> None:
+            made.append(self)
+
+        def process(self, frame: Frame) -> TrackingResult:
+            return TrackingResult(frame.stamp_ns, TrackingState.INITIALIZING)
+
+        def load_map(self, path: Path) -> None:
+            raise InputError(f"{path} is not there")
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr("thegra_core.slam.Slam", FakeSlam)
+    engine = LocalEngine(load_config("fast", overrides={"extractor.name": "orb"}))
+    camera = thermal_camera((2, 2))
+    engine.process(Job(Frame(0, 0, np.zeros((2, 2), np.uint8)), camera, 0))
+    with pytest.raises(InputError, match="not there"):
+        engine.obey(BeginIn(tmp_path / "none.map", camera, 1))
+    engine.process(Job(Frame(1, 1, np.zeros((2, 2), np.uint8)), camera, 1))
+    assert len(made) == 2, "one for the first frame, one that could not be used"
