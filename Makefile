@@ -63,7 +63,7 @@ $(VENV)/.torch: $(VENV)/.python
 
 $(VENV)/.installed: $(VENV)/.torch setup.py pyproject.toml package.xml
 	$(PIP) install --quiet --editable ".[$(EXTRAS)]"
-	[[ -z "$(ROS)" ]] || PIP="$(PIP)" tools/install_ros.sh
+	[[ -z "$(ROS)" ]] || PIP="$(PIP)" BIN="$(BIN)" tools/install_ros.sh
 	touch $@
 
 $(VENV)/.weights: $(VENV)/.installed $(wildcard thegra_core/features/weights.py)

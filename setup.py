@@ -91,5 +91,6 @@ setup(
     entry_points={
         "console_scripts": ["thegra = thegra_core.cli.main:main", *(f"{name} = thegra_ros.nodes.{name}:main" for name in NODES)],
         "thegra.commands": ["live = thegra_ros.commands:live", "play = thegra_ros.commands:play"],
+        "thegra.benchmarks": ["ros = thegra_ros.benchmark.commands:ros", "soak = thegra_ros.benchmark.commands:soak"],
     },
 )

@@ -287,6 +287,10 @@ class MappingConfig(Section):
     max_scale_ratio: float = Field(4.0, gt=1, description="distance of a new point in one view over that in the other")
     min_found_ratio: float = Field(0.25, ge=0, le=1, description="found / predicted visible below which a landmark is culled; paper: 25 %")
     trial_keyframes: int = Field(3, ge=1, description="keyframes after which a landmark must have trial_observations; ORB-SLAM3: 3")
+    redundant_share: float = Field(0.9, gt=0, le=1, description="share of a keyframe's landmarks that redundant_observers others must see from about as near for it to leave; ORB-SLAM3: 0.9")
+    redundant_observers: int = Field(3, ge=2, description="ORB-SLAM3: 3")
+    redundant_from: int = Field(500, ge=2, description="keyframes of a map from which on redundant ones leave; from 20 on it spares 4 % of them on a corridor loop and costs 10 % of the accuracy (measured)")
+    max_keyframes: int = Field(3000, ge=10, description="keyframes of a map beyond which the most redundant ones leave in any case; about 1 MB each")
     trial_observations: int = Field(3, ge=2, description="observations a landmark must have by then; ORB-SLAM3: 3")
 
 
@@ -324,10 +328,15 @@ class LoopConfig(Section):
     group: int = Field(3, ge=1, description="keyframes of the old place that the new one is matched to: the candidate and its best neighbours")
     min_matches: int = Field(40, ge=6, description="matches to the candidate alone")
     min_inliers: int = Field(40, ge=6, description="landmarks of the old place that must agree with one pose of the new keyframe")
+    min_visible_share: float = Field(0.2, ge=0, le=1, description="these over the landmarks of the old place that should be seen from there; where a building only repeats itself 0.05 to 0.18 agree, in real loops 0.17 to 0.45 (measured)")
+    max_drift_deg: float = Field(20.0, gt=0, description="degrees by which a loop may turn the newest keyframe: corridors that look alike at another heading turn it by 90 (measured), real loops by 1 to 5")
+    max_drift_ratio: float = Field(0.2, gt=0, description="distance by which a loop may move the newest keyframe, over the way since the old place; real loops 0.04 at the most, look-alikes 0.8 and more (measured)")
     min_scale_pairs: int = Field(10, ge=3, description="landmarks of both places that are the same points: they tell the scale")
     max_scale_spread: float = Field(0.1, gt=0, description="median deviation of the logarithm of their depths' ratio")
     max_rotation_deg: float = Field(3.0, gt=0, description="degrees by which a second keyframe may place the loop otherwise")
     max_translation_ratio: float = Field(0.1, gt=0, description="the same in position, over the median depth")
+    rotations: tuple[Literal[90, 180, 270], ...] = Field((), description="degrees by which the image of a frame that is not found is turned, for cameras that look at the ground and turn between two frames; each costs an extraction and the matches of such a frame, until a new map may begin")
+    full_adjustment_after: int = Field(3, ge=1, description="keyframes after a loop or a merge from which on the result of the full adjustment is taken")
 
 
 class ThegraConfig(Section):

@@ -77,7 +77,8 @@ class Features:
 
     keypoints (N, 2) float32 pixels of the raw (distorted) image; scores (N,) float32 in (0, 1];
     descriptors (N, D) float32 of unit norm, or (N, D) uint8 binary; image_size (width, height). track_ids (N,) int64, where keypoints are followed
-    from image to image: those of the same number are the same point; None where they are not.
+    from image to image: those of the same number are the same point; None where they are not. `turns` are the quarter turns counter-clockwise by which the
+    image was turned when they were found and described; keypoints and size are those of the upright image all the same.
     """
 
     stamp_ns: int
@@ -87,6 +88,7 @@ class Features:
     image_size: tuple[int, int]
     extractor: str
     track_ids: IntArray | None = None
+    turns: int = 0
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -184,24 +186,57 @@ class Absorbed:
 
 
 @dataclass(frozen=True, slots=True)
+class RemovedKeyframe:
+    """A keyframe that left its map, and the one that stays for it: `heir_from_removed` (4, 4) carries over what was placed beside it."""
+
+    id: int
+    stamp_ns: int
+    heir_id: int
+    heir_from_removed: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Revisit:
+    """A place seen again that changed a map: a loop within it, or another map that it took in (`absorbed_map_id`, -1 for a loop).
+
+    Keyframe `keyframe_id` of `stamp_ns` saw by `landmarks` landmarks what `old_keyframe_id` had seen. `moved` is by how much that moved it, over the scene's
+    median depth (0 for a merge, whose worlds had nothing to do with each other); `scale` old map units per new one.
+    """
+
+    stamp_ns: int
+    map_id: int
+    keyframe_id: int
+    old_keyframe_id: int
+    landmarks: int
+    moved: float
+    scale: float
+    absorbed_map_id: int = -1
+
+    @property
+    def is_loop(self) -> bool:
+        return self.absorbed_map_id < 0
+
+
+@dataclass(frozen=True, slots=True)
 class MapUpdate:
     """Everything that mapping changed since the last update; applying it to a replica makes the replica equal to the map.
 
     `new_keyframes` carry their features; `keyframes` restate pose and landmark ids of each keyframe that changed (the new ones too);
     `landmarks` restate each landmark that is new or changed; `absorbed` names a map that this one has taken in, and the update then holds all of the map;
-    `scales` tells by what factor the surroundings of keyframes grew, where a loop changed their scale.
+    `scales` tells by what factor the surroundings of keyframes grew, where a loop changed their scale; heirs of removed keyframes grow after they inherited.
     """
 
     version: int
     map_id: int
     new_keyframes: tuple[Keyframe, ...] = ()
     keyframes: tuple[KeyframeState, ...] = ()
-    removed_keyframe_ids: tuple[int, ...] = ()
+    removed_keyframes: tuple[RemovedKeyframe, ...] = ()
     landmarks: LandmarkArrays | None = None
     removed_landmark_ids: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     covisibility: Mapping[int, tuple[tuple[int, int], ...]] = field(default_factory=dict)  # keyframe id -> ((keyframe id, shared points), ...)
     absorbed: Absorbed | None = None
     scales: Mapping[int, float] = field(default_factory=dict)
+    revisits: tuple[Revisit, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,5 +331,6 @@ class Run:
     relocalizations: int = 0
     loops: int = 0
     merges: int = 0
+    revisits: tuple[Revisit, ...] = ()
     bad_frames: Mapping[str, int] = field(default_factory=dict)  # reason -> frames
     snapshots: tuple[Snapshot, ...] = ()

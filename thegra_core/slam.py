@@ -20,6 +20,7 @@ from thegra_core.features.nearest import Nearest
 from thegra_core.features.protocols import Extractor, FrontEnd, Matcher, Wanted
 from thegra_core.features.registry import make_extractor, make_frame_matcher
 from thegra_core.features.tracks import shared_tracks
+from thegra_core.features.turning import TurnableExtractor
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map, summarize
 from thegra_core.mapping.mapper import Mapper
@@ -32,6 +33,7 @@ from thegra_core.messages import (
     MapSummary,
     MapUpdate,
     Matches,
+    Revisit,
     Run,
     Shutter,
     ShutterState,
@@ -39,6 +41,7 @@ from thegra_core.messages import (
     TrackingResult,
     TrackingState,
 )
+from thegra_core.optimization.solver import BundleSolver
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.preprocessing.shutter import ShutterDetector
 from thegra_core.process import Usage
@@ -83,21 +86,32 @@ class Slam:
 
     Args:
         extractor, matcher: Instead of those configured.
+        keep_records: Remember every frame for `finish`. A live stream has no end and needs only the last one.
         beside: Map in a process of its own, with the matcher configured: `process` never waits for it, and what becomes of a run depends on the machine.
+        solver: Makes the full adjustments after loops and merges, see `Mapper`; beside, they are made in processes of their own.
 
     Raises:
         WeightsError: If the configured networks' weights are not there.
     """
 
     def __init__(
-        self, camera: CameraModel, config: ThegraConfig, extractor: Extractor | None = None, matcher: Matcher | None = None, beside: bool = False
+        self,
+        camera: CameraModel,
+        config: ThegraConfig,
+        extractor: Extractor | None = None,
+        matcher: Matcher | None = None,
+        *,
+        keep_records: bool = True,
+        beside: bool = False,
+        solver: BundleSolver | None = None,
     ) -> None:
         self._camera = camera
         self._chain = Chain(config.preprocessing)
         self._shutter = ShutterDetector(config.preprocessing.shutter)
         self._fixed_pattern = FixedPatternMask()
         self._masks = config.tracking.mask_fixed_pattern
-        self._extractor = extractor if extractor is not None else make_extractor(config.extractor)
+        self._rotations = config.loop.rotations
+        self._extractor = TurnableExtractor(extractor if extractor is not None else make_extractor(config.extractor))
         nearest = Nearest(config.matcher) if config.tracking.match_by == "nearest" and matcher is None else None
         self._matcher = make_frame_matcher(config, nearest or matcher)
         self._front_end: FrontEnd = DetectEach(self._extractor)
@@ -106,13 +120,15 @@ class Slam:
         self._mapping: MappingService = (
             MappingProcess(camera, config, make_frame_matcher)
             if beside
-            else InlineMapping(Mapper(camera, config, self._matcher if nearest is None else make_frame_matcher(config)))
+            else InlineMapping(Mapper(camera, config, self._matcher if nearest is None else make_frame_matcher(config), solver))
         )
         self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit)
         self._frames: list[_Placed] = []
+        self._keep_records = keep_records
         self._last_stamp_ns: int | None = None
         self._backward, self._backward_ns = 0, None  # type: int, int | None
         self._bad: Counter[str] = Counter()
+        self._revisits: list[Revisit] = []
         self._closures: list[tuple[int, int]] = []
         self._snapshots = SnapshotKeeper()
         self._view: Callable[[], Snapshot] | None = None
@@ -231,6 +247,7 @@ class Slam:
             losses=self._tracking.losses,
             loops=loops,
             merges=merges,
+            revisits=tuple(self._revisits),
             relocalizations=self._tracking.relocalizations,
             bad_frames=dict(self._bad),
             snapshots=self._snapshots.kept(),
@@ -255,6 +272,11 @@ class Slam:
         self._snapshots.offer(frame.index, self._view)
         return output
 
+    def _otherwise(self, image: NDArray[np.uint8], stamp_ns: int) -> Iterator[Features]:
+        """The features of the other orientations, each found when it is asked for."""
+        for degrees in self._rotations:
+            yield self._fixed_pattern.apply(self._extractor.turned(image, stamp_ns, degrees // 90))
+
     def _front(self, image: NDArray[np.uint8], stamp_ns: int, reference: Features | None) -> tuple[Features, TrackingOutput]:
         """Features of the image and what tracking made of them: of those followed, if there are any and they suffice, else of what is detected."""
         with self._timed("flow"):
@@ -274,7 +296,12 @@ class Slam:
         with self._timed("matching"):
             matches = self._unmasked(features, reference, self._matcher.match(features, reference)) if reference is not None else None
         with self._timed("tracking"):
-            return features, self._tracking.process(features, matches)
+            output = self._tracking.process(features, matches, self._otherwise(image, stamp_ns))
+        if output.found_turned is not None:
+            features = output.found_turned
+            self._extractor.turns = features.turns
+            self._front_end.forget()
+        return features, output
 
     def _unmasked(self, features: Features, reference: Features, matches: Matches) -> Matches:
         return self._fixed_pattern.learn(features, reference, matches) if self._masks else matches
@@ -327,6 +354,8 @@ class Slam:
                 self._closures.append((shutter.stamp_ns, shutter.stamp_ns))
 
     def _record(self, index: int, result: TrackingResult, provisional: TrackingResult | None, bad: bool) -> None:
+        if not self._keep_records:
+            self._frames.clear()
         placed = provisional or result
         if placed.state is not TrackingState.TRACKING or placed.world_from_camera is None:
             self._frames.append(_Placed(result, index, bad=bad))
@@ -335,7 +364,10 @@ class Slam:
         self._frames.append(_Placed(result, index, self._tracking.map_id, reference_id, relative, afterwards=provisional is not None))
 
     def _follow(self, update: MapUpdate) -> None:
-        """Frames keep their place beside their keyframe when a loop changes the scale there, or their map becomes part of another."""
+        """Frames keep their place when their keyframe leaves the map, when a loop changes the scale there, or their map becomes part of another."""
+        self._revisits.extend(update.revisits)
+        if update.removed_keyframes:
+            self._inherit(update)
         absorbed = update.absorbed
         if not update.scales and absorbed is None:
             return
@@ -346,6 +378,18 @@ class Slam:
                 self._frames[row] = placed.scaled(absorbed.scale, update.map_id)
             elif placed.map_id == update.map_id:
                 self._frames[row] = placed.scaled(update.scales.get(placed.reference_id, 1.0), update.map_id)
+
+    def _inherit(self, update: MapUpdate) -> None:
+        removed = {r.id: r for r in update.removed_keyframes}
+        by_stamp = {r.stamp_ns: r for r in removed.values() if r.id >= self._first_keyframe_id}
+        map_id = update.map_id if update.absorbed is None else update.absorbed.map_id
+        for row, placed in enumerate(self._frames):
+            gone = removed.get(placed.reference_id)
+            if placed.reference_from_camera is not None and gone is not None:
+                self._frames[row] = replace(placed, reference_id=gone.heir_id, reference_from_camera=gone.heir_from_removed @ placed.reference_from_camera)
+            elif placed.may_be_placed and placed.result.stamp_ns in by_stamp:  # a frame of before the first map, which was this keyframe
+                gone = by_stamp[placed.result.stamp_ns]
+                self._frames[row] = replace(placed, map_id=map_id, reference_id=gone.heir_id, reference_from_camera=gone.heir_from_removed, afterwards=True)
 
     def _drop(self, map_id: int) -> None:
         """Forget a map and the places of frames in it."""

@@ -24,6 +24,10 @@ class CameraPlace:
         looks_up = own.base_frame and not own.base_from_camera
         self._fixed = FixedTransforms(node) if looks_up else None
 
+    def knows(self, frame_id: str) -> bool:
+        """Whether it is told where a camera of that frame sits on the base."""
+        return self._fixed is None or self._fixed.find(self._own.base_frame, frame_id) is not None
+
     def see(self, frame_id: str) -> None:
         """Name the camera's frame after an image, and find where it sits."""
         camera = self._own.camera_frame or frame_id or "camera"

@@ -11,15 +11,17 @@ import signal
 import threading
 import time
 import traceback
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 from thegra_core.config import ThegraConfig
-from thegra_core.errors import ThegraError
+from thegra_core.errors import InputError, ThegraError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame, MapSummary, Snapshot, TrackingResult
 from thegra_core.process import keep_freed_memory, set_threads
+from thegra_ros.image_slot import make_slot, put, take
 
 if TYPE_CHECKING:
     from thegra_core.features.protocols import Extractor, Matcher
@@ -36,13 +38,37 @@ class EngineError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A frame and what is wanted beside its result. Another `epoch` than the last job's begins a new map."""
+    """A frame and what is wanted beside its result. Another `epoch` than the last job's begins anew: in the map of the file `home`, else in an empty one.
+
+    localization_only: the map stays as it is.
+    """
 
     frame: Frame
     camera: CameraModel
     epoch: int
     wants_view: bool = False
     wants_map: bool = False
+    home: Path | None = None
+    localization_only: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SaveMap:
+    """Write the map to a file."""
+
+    path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class BeginIn:
+    """Begin in the map of a file. Frames of `epoch` are in it; if it cannot be, they are in the map that was there before."""
+
+    path: Path
+    camera: CameraModel
+    epoch: int
+
+
+Order = SaveMap | BeginIn
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +94,15 @@ class Engine(Protocol):
         """Work on a frame, waiting for the result.
 
         Raises:
+            EngineError: If it failed.
+            ThegraError: If the map of `home` cannot be used.
+        """
+
+    def obey(self, order: Order) -> str:
+        """Do what is ordered, waiting for it; what to say about it.
+
+        Raises:
+            ThegraError: If it cannot be done; all is as it was.
             EngineError: If it failed.
         """
 
@@ -101,20 +136,54 @@ class LocalEngine:
             self.stop()
             raise EngineError(traceback.format_exc()) from error
 
+    def obey(self, order: Order) -> str:
+        try:
+            return self._save(order.path) if isinstance(order, SaveMap) else self._begin_in(order)
+        except ThegraError:
+            raise
+        except Exception as error:
+            self.stop()
+            raise EngineError(traceback.format_exc()) from error
+
     def stop(self) -> None:
         if self._slam is not None:
             self._slam.close()
         self._slam = None
 
+    def _save(self, path: Path) -> str:
+        if self._slam is None:
+            raise InputError(f"there is no map yet that could be written to {path}")
+        self._slam.save_map(path)
+        return f"the map is in {path}"
+
+    def _begin_in(self, order: BeginIn) -> str:
+        self._replace(self._new(order.camera, order.path), order.epoch)
+        return f"the camera is sought in the map of {order.path}"
+
     def _slam_for(self, job: Job) -> Slam:
         if self._slam is None or job.epoch != self._epoch:
-            from thegra_core.slam import Slam
-
-            if self._networks is None:
-                self.start()
-            self.stop()
-            self._slam, self._epoch = Slam(job.camera, self._config, *(self._networks or ()), beside=self._beside), job.epoch
+            self._replace(self._new(job.camera, job.home), job.epoch)
+        self._slam.localization_only = job.localization_only
         return self._slam
+
+    def _new(self, camera: CameraModel, home: Path | None) -> Slam:
+        from thegra_core.optimization.solver import ProcessSolver
+        from thegra_core.slam import Slam
+
+        if self._networks is None:
+            self.start()
+        made = Slam(camera, self._config, *(self._networks or ()), keep_records=False, beside=self._beside, solver=ProcessSolver())
+        try:
+            if home is not None:
+                made.load_map(home)
+        except BaseException:
+            made.close()
+            raise
+        return made
+
+    def _replace(self, made: Slam, epoch: int) -> None:
+        self.stop()
+        self._slam, self._epoch = made, epoch
 
 
 class ProcessEngine:
@@ -123,7 +192,8 @@ class ProcessEngine:
     def __init__(self, config: ThegraConfig) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=serve, args=(theirs, config), daemon=True, name="thegra engine")
+        self._slot = make_slot(context)
+        self._process = context.Process(target=serve, args=(theirs, config, self._slot), daemon=True, name="thegra engine")
         self._theirs = theirs
         self._sending = threading.Lock()
 
@@ -135,15 +205,12 @@ class ProcessEngine:
             raise answer
 
     def process(self, job: Job) -> Done:
-        try:
-            with self._sending:
-                self._connection.send(job)
-        except OSError as error:
-            raise EngineError(self._epitaph()) from error
-        answer = self._receive()
-        if isinstance(answer, Done):
-            return answer
-        raise EngineError(str(answer))
+        answer = self._ask(replace(job, frame=put(self._slot, job.frame)))
+        assert isinstance(answer, Done)
+        return answer
+
+    def obey(self, order: Order) -> str:
+        return str(self._ask(order))
 
     def stop(self) -> None:
         if self._process.pid is None:
@@ -162,6 +229,17 @@ class ProcessEngine:
     def alive(self) -> bool:
         return self._process.is_alive()
 
+    def _ask(self, what: Job | Order) -> object:
+        try:
+            with self._sending:
+                self._connection.send(what)
+        except OSError as error:
+            raise EngineError(self._epitaph()) from error
+        answer = self._receive()
+        if isinstance(answer, EngineError | ThegraError):
+            raise answer
+        return answer
+
     def _receive(self) -> object:
         try:
             return self._connection.recv()
@@ -174,8 +252,8 @@ class ProcessEngine:
         return f"the process of the SLAM system has ended with code {code}" + (" (killed; out of memory?)" if code == -signal.SIGKILL else "")
 
 
-def serve(connection: Connection, config: ThegraConfig) -> None:
-    """Work on jobs until told to end or the other end is gone; runs in the engine's process."""
+def serve(connection: Connection, config: ThegraConfig, slot: Any) -> None:
+    """Work on jobs and orders until told to end or the other end is gone; runs in the engine's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to the whole group; the node tells when to end
     logging.basicConfig(level=logging.INFO, format="[thegra engine] %(levelname)s %(message)s")
     keep_freed_memory()
@@ -189,23 +267,23 @@ def serve(connection: Connection, config: ThegraConfig) -> None:
     connection.send("ready")
     _log.info("networks loaded in %.1f s", time.perf_counter() - begin)
     try:
-        _answer(connection, engine)
+        _answer(connection, engine, slot)
     finally:
         engine.stop()
 
 
-def _answer(connection: Connection, engine: LocalEngine) -> None:
+def _answer(connection: Connection, engine: LocalEngine, slot: Any) -> None:
     while True:
         try:
-            job = connection.recv()
+            asked = connection.recv()
         except (EOFError, OSError):
             return
-        if job is None:
+        if asked is None:
             return
         try:
-            answer: object = engine.process(job)
-        except EngineError as error:
-            answer = str(error)
+            answer: object = engine.process(replace(asked, frame=take(slot, asked.frame))) if isinstance(asked, Job) else engine.obey(asked)
+        except (EngineError, ThegraError) as error:
+            answer = error
         try:
             connection.send(answer)
         except OSError:

@@ -14,12 +14,17 @@ def use_large_segments() -> Path | None:
 
     With its own 512 KiB it cuts a 640x512 image of 16 bit into pieces and loses most of them on a best-effort topic (measured, docs/ros.md).
     """
-    if PROFILES_VARIABLE in os.environ or "FASTDDS_DEFAULT_PROFILES_FILE" in os.environ:
+    if profile_is_set():
         return None
     found = config_file("fastdds.xml")
     if found is not None:
         os.environ[PROFILES_VARIABLE] = str(found)
     return found
+
+
+def profile_is_set() -> bool:
+    """Whether a profile of Fast DDS is chosen for this process."""
+    return PROFILES_VARIABLE in os.environ or "FASTDDS_DEFAULT_PROFILES_FILE" in os.environ
 
 
 def config_file(name: str) -> Path | None:

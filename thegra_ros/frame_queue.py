@@ -10,10 +10,14 @@ T = TypeVar("T")
 
 
 class LatestQueue(Generic[T]):
-    """Holds the newest items: when it is full the oldest goes, and is counted. Any thread may put, one thread gets."""
+    """Holds the newest items: when it is full the oldest goes, and is counted. Any thread may put, one thread gets.
+
+    What is put with `put_first` comes before all of them, is never dropped, and does not count for the size.
+    """
 
     def __init__(self, size: int) -> None:
         self._items: deque[T] = deque()
+        self._urgent: deque[T] = deque()
         self._size = size
         self._changed = threading.Condition()
         self._closed = False
@@ -30,24 +34,37 @@ class LatestQueue(Generic[T]):
             self._items.append(item)
             self._changed.notify()
 
-    def get(self) -> T | None:
-        """The oldest item, waiting for one; None once the queue is closed."""
+    def put_first(self, item: T) -> bool:
+        """Add an item that must not be lost; False once the queue is closed."""
         with self._changed:
-            while not self._items and not self._closed:
+            if not self._closed:
+                self._urgent.append(item)
+                self._changed.notify()
+            return not self._closed
+
+    def get(self) -> T | None:
+        """The next item, waiting for one; None once the queue is closed."""
+        with self._changed:
+            while not self._items and not self._urgent and not self._closed:
                 self._changed.wait()
-            return None if self._closed else self._items.popleft()
+            if self._closed:
+                return None
+            return self._urgent.popleft() if self._urgent else self._items.popleft()
 
     def clear(self) -> None:
-        """Forget what waits; it does not count as dropped."""
+        """Forget the items that wait and may be dropped; they do not count as dropped."""
         with self._changed:
             self._items.clear()
 
-    def close(self) -> None:
-        """Let `get` return None from now on."""
+    def close(self) -> list[T]:
+        """Let `get` return None from now on; what was put first and is left."""
         with self._changed:
             self._closed = True
             self._items.clear()
+            left = list(self._urgent)
+            self._urgent.clear()
             self._changed.notify_all()
+            return left
 
     def __len__(self) -> int:
         with self._changed:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+MOST_PENDING = 200
+"""Frames with some of their parts; the oldest goes when there are more, as when nothing announces them."""
+
 
 class FrameJoiner:
     """Frames come out in the order in which `first` announces them, each once `complete` says that its parts are there.
@@ -23,6 +26,9 @@ class FrameJoiner:
             self._pending[stamp_ns] = {**self._pending.pop(stamp_ns, {}), part: value}
         else:
             self._pending.setdefault(stamp_ns, {})[part] = value
+        if len(self._pending) > MOST_PENDING:
+            del self._pending[next(iter(self._pending))]
+            self.lost += 1
         announced = [stamp for stamp, parts in self._pending.items() if self._first in parts]
         last = max((i for i, s in enumerate(announced) if self._complete(self._pending[s]) and not self._stands_alone(self._pending[s])), default=-1)
         ready: list[dict[str, Any]] = []

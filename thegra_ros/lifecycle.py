@@ -4,29 +4,32 @@ from __future__ import annotations
 
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from thegra_core.errors import ThegraError
+from thegra_ros.answers import answering
 from thegra_ros.qos import publisher_options, subscription_options
 
 
 class ManagedNode(LifecycleNode):
     """Derived nodes override `configure`, `activate`, `deactivate` and `release`.
 
-    A ThegraError they raise is logged as one message and the transition fails; anything else is logged with its traceback. Publishers, subscriptions,
-    timers and services made through `publisher`, `listen`, `serve` and `every` are removed when the node is cleaned up.
+    A ThegraError they raise is logged as one message and the transition fails; anything else is logged with its traceback. Publishers, subscriptions and
+    timers made through `publisher`, `listen` and `every` are removed when the node is cleaned up; services made through `offer` answer in every state.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
-        self.active = False
+        self.configured = self.active = False
         self._mine: list[tuple[Callable[[Any], Any], Any]] = []
+        self._waiting_services = ReentrantCallbackGroup()  # one that waits for its answer holds nothing up
         self._guard_transitions()
         self._autostart = bool(self.declare_parameter("autostart", True, ParameterDescriptor(description="configure and activate the node when it starts")).value)
 
@@ -64,9 +67,12 @@ class ManagedNode(LifecycleNode):
         self._mine.append((self.destroy_subscription, made))
         return made
 
-    def serve(self, kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:
-        """A service."""
-        self._mine.append((self.destroy_service, self.create_service(kind, name, callback)))
+    def offer(self, kind: type, name: str, handle: Callable[[Any], str | Awaitable[str]]) -> None:
+        """A service (Trigger or SetBool) for as long as the node lives; `handle` gets the request and returns what to say.
+
+        A ThegraError, or a call while the node is not configured, is the answer `success: false` with its message; nothing else is raised into the node.
+        """
+        self.create_service(kind, name, answering(self, name, handle), callback_group=self._waiting_services)
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """A timer of the machine's time, whatever simulated time does."""
@@ -77,6 +83,7 @@ class ManagedNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         result = self._try(self.configure, lambda: super(ManagedNode, self).on_configure(state))
+        self.configured = result == TransitionCallbackReturn.SUCCESS
         if result != TransitionCallbackReturn.SUCCESS:
             self._undo()
         return result
@@ -107,6 +114,7 @@ class ManagedNode(LifecycleNode):
         self._try(self._undo)
 
     def _undo(self) -> None:
+        self.configured = False
         self.release()
         for destroy, entity in reversed(self._mine):
             destroy(entity)

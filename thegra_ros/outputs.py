@@ -74,11 +74,12 @@ class PoseOutputs:
         predicted = result.state is TrackingState.HOLD
         pose = stamped_pose(result.stamp_ns, result.world_from_camera, result.covariance, result.twist, frames, predicted)
         stamped = header(result.stamp_ns, frames.map)
-        self._odometry.publish(odometry(stamped, frames.child, pose))
         if predicted:
+            self._odometry.publish(odometry(stamped, frames.child, pose))
             self.transforms.repeat(result.stamp_ns, frames)
             return
         self._pose.publish(pose_with_covariance(stamped, pose))
+        self._odometry.publish(odometry(stamped, frames.child, pose))
         self.transforms.publish(pose, frames)
         if result.map_id != self._map_id:
             self.forget()

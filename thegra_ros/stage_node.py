@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import threading
 import traceback
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
 from typing import Any
 
 from thegra_core.errors import ThegraError
 from thegra_core.process import keep_freed_memory, set_threads
+from thegra_ros.answers import result_of
 from thegra_ros.diagnostics import Health, Reporter
 from thegra_ros.frame_queue import LatestQueue
 from thegra_ros.lifecycle import ManagedNode
@@ -19,6 +23,14 @@ EVERYTHING = 10**6
 """Size of a queue that drops nothing."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Something to do between two items."""
+
+    do: Callable[[], str]
+    answer: Future[str] = field(default_factory=Future)
+
+
 class StageNode(ManagedNode):
     """Derived nodes override `prepare` (topics), `load` (networks, in the thread), `work` (one item, in the thread) and `begin_anew`."""
 
@@ -27,7 +39,7 @@ class StageNode(ManagedNode):
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
         keep_freed_memory()
-        self._settings = NodeParameters(self)
+        self.settings = NodeParameters(self)
         self.queue: LatestQueue[Any] | None = None
         self._thread: threading.Thread | None = None
         self.stopping = threading.Event()
@@ -53,8 +65,25 @@ class StageNode(ManagedNode):
         if self.active and self.queue is not None:
             self.queue.put(item)
 
+    async def ask(self, do: Callable[[], str]) -> str:
+        """Have something done in the thread, before the items that wait; what it returned.
+
+        Raises:
+            Exception: What it raised.
+        """
+        task = _Task(do)
+        if self.queue is None or not self.queue.put_first(task):
+            _refuse(task)
+        return await result_of(self, task.answer)
+
+    def tell(self, text: str) -> None:
+        """Say what keeps the stage from working."""
+        self.get_logger().error(text)
+        self.health.trouble = text.strip().splitlines()[-1]
+        self.reporter.report()
+
     def configure(self) -> None:
-        self.config, self.own = self._settings.read()
+        self.config, self.own = self.settings.read()
         set_threads(self.config.threads)
         self.health = Health()
         self.reporter = Reporter(self, self.health, lambda: {"dropped": self.queue.dropped if self.queue is not None else 0, **self.facts()})
@@ -63,36 +92,55 @@ class StageNode(ManagedNode):
         self.prepare()
         self._thread = threading.Thread(target=self._run, args=(self.queue,), name="thegra stage", daemon=True)
         self._thread.start()
-        self._settings.configured = True
+        self.settings.configured = True
 
     def release(self) -> None:
         self.stopping.set()
         if self.queue is not None:
-            self.queue.close()
+            _close(self.queue)
         if self._thread is not None:
             self._thread.join(None if self.context.ok() else LAST_S)  # a process that ends does not wait for networks to load
         self.queue = self._thread = None
-        self._settings.configured = False
+        self.settings.configured = False
 
     def _run(self, queue: LatestQueue[Any]) -> None:
         try:
             self.load()
-        except ThegraError as error:
-            self._tell(str(error))
-            return
-        while (item := queue.get()) is not None:
-            if not self.active:
-                continue
-            try:
-                self.work(item)
-                self.health.done += 1
-            except Exception as error:  # a thread that ends without a word would be a node that does nothing
-                if self.stopping.is_set() or not self.context.ok():
+            while (item := queue.get()) is not None:
+                if isinstance(item, _Task):
+                    _do(item)
+                elif self.active and not self._worked_on(item):
                     return
-                self._tell(str(error) if isinstance(error, ThegraError) else traceback.format_exc())
-                self.begin_anew("the stage failed")
+        except ThegraError as error:
+            self.tell(str(error))
+        finally:
+            _close(queue)
 
-    def _tell(self, text: str) -> None:
-        self.get_logger().error(text)
-        self.health.trouble = text.strip().splitlines()[-1]
-        self.reporter.report()
+    def _worked_on(self, item: Any) -> bool:
+        """Work on an item, whatever becomes of it; False when the node ends."""
+        try:
+            self.work(item)
+            self.health.done += 1
+        except Exception as error:  # a thread that ends without a word would be a node that does nothing
+            if self.stopping.is_set() or not self.context.ok():
+                return False
+            self.tell(str(error) if isinstance(error, ThegraError) else traceback.format_exc())
+            self.begin_anew("the stage failed")
+        return True
+
+
+def _do(task: _Task) -> None:
+    try:
+        task.answer.set_result(task.do())
+    except Exception as error:  # it is the asker's to tell
+        task.answer.set_exception(error)
+
+
+def _close(queue: LatestQueue[Any]) -> None:
+    for item in queue.close():
+        if isinstance(item, _Task):
+            _refuse(item)
+
+
+def _refuse(task: _Task) -> None:
+    task.answer.set_exception(ThegraError("the stage does not work: /diagnostics and the log say why"))

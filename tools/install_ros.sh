@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Installs ROS 2 Jazzy's Python packages into the environment of $PIP, for the nodes and their tests. There are wheels for Linux on x86-64 only; elsewhere, or
+# Installs ROS 2 Jazzy's Python packages into the environment of $PIP and $BIN, for the nodes and their tests. There are wheels for Linux on x86-64 only; elsewhere, or
 # where they cannot be had, Thegra works on recordings and the nodes' tests are skipped. A ROS that is sourced is used as it is.
 set -euo pipefail
 
@@ -12,4 +12,6 @@ if [[ "$(uname -s)-$(uname -m)" != Linux-x86_64 ]]; then
 fi
 if ! $PIP install --quiet --editable ".[ros]"; then
     echo "ROS 2 could not be installed: 'thegra live', 'thegra play' and their tests are left out; all else works" >&2
+    exit 0
 fi
+tools/build_tf2_msgs.sh

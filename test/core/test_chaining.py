@@ -59,3 +59,14 @@ def test_a_graph_tells_what_lies_two_matches_away() -> None:
     assert graph.chained(3, 0) == [] and graph.chained(99, 5) == []
     graph.add(4, 3, made([(0, 6)]))
     assert [(other, pairs_of(m)) for other, m in graph.chained(4, 5)] == [(2, [(0, 0)])], "keyframe 1 is two matches away, but no keypoint goes all the way"
+
+
+def test_a_removed_keyframe_leaves_no_matches() -> None:
+    graph = MatchGraph()
+    for one, other in ((1, 0), (2, 1), (3, 2)):
+        graph.add(one, other, Matches(one, other, np.array([[0, 0], [1, 1]], np.int32), np.ones(2, np.float32)))
+    assert [far for far, _ in graph.chained(3, 9)] == [1]
+    graph.remove(2)
+    graph.remove(7)
+    assert graph.chained(3, 9) == [] and graph.chained(1, 9) == []
+    assert graph.arrays()["edges"].tolist() == [[1, 0]]

@@ -7,8 +7,9 @@ import pytest
 from test_map_editor import CAMERA, keyframe
 
 from thegra_core.config import MappingConfig
+from thegra_core.geometry import poses
 from thegra_core.map.editor import MapEditor
-from thegra_core.mapping.culling import count_visibility, failed_trial, untrackable
+from thegra_core.mapping.culling import NEWEST_KEPT, count_visibility, failed_trial, redundancy, remove_redundant, untrackable
 from thegra_core.messages import VisibilityCounts
 
 
@@ -67,3 +68,54 @@ def test_the_trial_of_the_default_configuration_can_be_failed(editor: MapEditor)
     """A landmark that nobody but its two creators ever saw is what the trial is for (ORB-SLAM3: more than two observations)."""
     remove, _ = failed_trial(editor, [0, 1, 2, 3], 20, MappingConfig())
     assert remove == [0, 1, 2]
+
+
+# ---- keyframes ----------------------------------------------------------------------------------------------------------------------
+
+
+def row_of_keyframes(count: int, seen_by: list[list[int]], x: list[float] | None = None) -> MapEditor:
+    """Keyframes at x; landmark i, four units ahead of the origin, is seen by the keyframes `seen_by[i]`."""
+    editor = MapEditor(0, CAMERA, 1)
+    for number in range(count):
+        editor.add_keyframe(keyframe(number, count=20))
+        editor.map.keyframes[number].world_from_camera = poses.transform(np.eye(3), [x[number] if x else 0.0, 0, 0])
+    for feature, (landmark, observers) in enumerate(zip(editor.add_landmarks(np.tile([0.0, 0, 4], (len(seen_by), 1)), 0).tolist(), seen_by, strict=True)):
+        for number in observers:
+            editor.observe(landmark, number, feature)
+    for number in range(count):
+        editor.connect(number)
+    return editor
+
+
+def test_redundancy_is_the_share_that_three_others_see() -> None:
+    editor = row_of_keyframes(5, [[0, 1, 2, 3], [0, 1, 2, 3, 4], [0, 1, 2], [1, 2]])
+    assert redundancy(editor, 0, 3) == pytest.approx(2 / 3)
+    assert redundancy(editor, 4, 3) == 1.0
+    assert redundancy(editor, 0, 2) == 1.0
+
+
+def test_one_that_sees_from_farther_off_is_no_replacement() -> None:
+    """Keyframe 3 is 5 from the points, the others 4; 5 / 4 is more than one step of 1.2."""
+    editor = row_of_keyframes(4, [[0, 1, 2, 3]] * 3, x=[0.0, 0.0, 0.0, 3.0])
+    assert redundancy(editor, 0, 3) == 0.0
+    assert redundancy(editor, 3, 3) == 1.0
+
+
+def test_redundant_keyframes_leave_and_the_oldest_and_newest_stay() -> None:
+    count = 12
+    editor = row_of_keyframes(count, [list(range(count))] * 6)
+    assert remove_redundant(editor, count - 1, MappingConfig(redundant_from=count)) == []
+    removed = remove_redundant(editor, count - 1, MappingConfig(redundant_from=2))
+    assert removed == list(range(1, count - NEWEST_KEPT))
+    assert sorted(editor.map.keyframes) == [0, *range(count - NEWEST_KEPT, count)]
+    assert len(editor.map.landmarks) == 6, "what they saw is still there"
+
+
+def test_needed_keyframes_stay_until_the_budget_is_spent() -> None:
+    """Pairs that see the same: none is redundant, but a map may not grow without end."""
+    pairs = [[i, i + 1] for i in range(0, 30, 2)]
+    editor = row_of_keyframes(30, [*pairs, [20, 21, 22, 23]])
+    assert remove_redundant(editor, 29, MappingConfig(redundant_from=2, max_keyframes=30)) == []
+    removed = remove_redundant(editor, 29, MappingConfig(redundant_from=2, max_keyframes=24))
+    assert len(removed) == 6 and not {0, 25, 26, 27, 28, 29} & set(removed)
+    assert removed == remove_redundant(row_of_keyframes(30, [*pairs, [20, 21, 22, 23]]), 29, MappingConfig(redundant_from=2, max_keyframes=24))

@@ -39,6 +39,8 @@ class Editing(RuleBasedStateMachine):
         self.replica = Map(0, CAMERA)
         self.ever: set[int] = set()
         self.version = 0
+        self.inheritance: dict[int, np.ndarray] = {}
+        self.next_keyframe = 1
         self.editor.add_keyframe(keyframe(0))
 
     def landmark(self, pick: int) -> int:
@@ -58,7 +60,8 @@ class Editing(RuleBasedStateMachine):
         ids = np.full(KEYPOINTS, NO_LANDMARK, np.int64)
         chosen = rng.permutation(pool)[:KEYPOINTS]
         ids[: len(chosen)] = chosen
-        number = len(self.editor.map.keyframes)
+        number = self.next_keyframe
+        self.next_keyframe += 1
         self.editor.add_keyframe(keyframe(number, ids))
         self.editor.connect(number)
 
@@ -103,6 +106,18 @@ class Editing(RuleBasedStateMachine):
             assert set(self.editor.observers[keep]) == seen
             assert (self.editor.visible[keep], self.editor.found[keep]) == counts
 
+    @rule(pick=st.integers(0, 99))
+    @precondition(lambda self: len(self.editor.map.keyframes) > 1)
+    def remove_keyframe(self, pick: int) -> None:
+        chosen = self.camera(pick)
+        pose = self.editor.map.keyframes[chosen].world_from_camera
+        left = {i: set(seen) - {chosen} for i, seen in self.editor.observers.items()}
+        shared = {i for i, seen in self.editor.observers.items() if chosen in seen}
+        self.editor.remove_keyframe(chosen)
+        assert {i: set(seen) for i, seen in self.editor.observers.items()} == {i: seen for i, seen in left.items() if i not in shared or len(seen) > 1}
+        assert all(chosen not in dict(edges) for edges in self.editor.map.covisibility.values())
+        self.inheritance[chosen] = pose
+
     @rule(seed=st.integers(0, 10**6))
     def move(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -139,6 +154,9 @@ class Editing(RuleBasedStateMachine):
         self.replica.apply(update)
         original = self.editor.map
         assert sorted(self.replica.keyframes) == sorted(original.keyframes)
+        assert {r.id for r in update.removed_keyframes} == set(self.inheritance)
+        assert all(r.heir_id in original.keyframes and r.stamp_ns == 1000 * r.id for r in update.removed_keyframes)
+        self.inheritance.clear()
         for i, expected in original.keyframes.items():
             found = self.replica.keyframes[i]
             np.testing.assert_array_equal(found.world_from_camera, expected.world_from_camera)
@@ -258,3 +276,24 @@ def test_median_depth_is_of_the_living_in_front() -> None:
     editor.remove_landmarks([4])
     assert editor.map.median_depth(0) == 2.0
     assert editor.map.median_depth(0, poses.transform(np.eye(3), [0, 0, -1.0])) == 3.0
+
+
+def test_the_heir_takes_over_what_is_placed_beside_a_removed_keyframe() -> None:
+    """Two that leave one after the other, the first to the second: the last heir tells where both were."""
+    editor = MapEditor(0, CAMERA, THRESHOLD)
+    for number in range(3):
+        editor.add_keyframe(keyframe(number))
+    for one, other in ((0, 1), (1, 2)):
+        for feature, landmark in enumerate(editor.add_landmarks(np.ones((4, 3)), one).tolist(), start=4 * one):
+            editor.observe(landmark, one, feature)
+            editor.observe(landmark, other, feature)
+    for number in range(3):
+        editor.connect(number)
+    before = {i: k.world_from_camera for i, k in editor.map.keyframes.items()}
+    editor.take_update()
+    editor.remove_keyframe(0)
+    editor.remove_keyframe(1)
+    removed = editor.take_update().removed_keyframes
+    assert [(r.id, r.heir_id) for r in removed] == [(0, 2), (1, 2)]
+    for r in removed:
+        np.testing.assert_allclose(before[2] @ r.heir_from_removed, before[r.id], atol=1e-12)

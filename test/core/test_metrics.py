@@ -11,13 +11,14 @@ from made_runs import BEGIN_NS, PERIOD_NS, make_camera, make_run, true_pose
 
 from thegra_core.config import load_config
 from thegra_core.errors import InputError
+from thegra_core.messages import Revisit
 from thegra_core.outputs.files import sha256_of, write_atomic
 from thegra_core.outputs.metrics import Timing, run_metrics, score_run
 from thegra_core.outputs.pointcloud import format_ply
 from thegra_core.outputs.trajectory import format_tum, make_trajectory, read_tum
 from thegra_core.outputs.write import RecordingFacts, write_run
 
-REQUIRED = ["frames_total", "frames_tracked", "frames_held", "frames_lost", "frames_initializing", "frames_bad", "tracked_pct", "tracked_any_pct", "maps", "keyframes", "landmarks", "losses", "relocalizations", "loops", "merges", "shutter_closures", "fps", "ms_per_frame", "ms", "dropped_frames", "peak_rss_mb", "seed", "profile", "version"]
+REQUIRED = ["frames_total", "frames_tracked", "frames_held", "frames_lost", "frames_initializing", "frames_bad", "tracked_pct", "tracked_any_pct", "maps", "keyframes", "landmarks", "losses", "relocalizations", "loops", "merges", "loop_events", "loss_events", "shutter_closures", "fps", "ms_per_frame", "ms", "dropped_frames", "peak_rss_mb", "seed", "profile", "version"]
 WITH_TRUTH = ["ate_rmse", "ate_live_rmse", "ate_scale", "path_length"]
 TIMING = Timing(wall_s=4.0, frames_read=20, finish_s=0.5)
 
@@ -182,3 +183,17 @@ def test_checksum_of_a_folder_sees_names_and_contents(tmp_path: Path) -> None:
     second = sha256_of(tmp_path)
     (tmp_path / "a" / "2.png").write_bytes(b"two")
     assert len({first, second, sha256_of(tmp_path)}) == 3
+
+
+def test_losses_and_revisits_are_told_one_by_one() -> None:
+    run = replace(
+        make_run("iitthtlllhltttllrt"),
+        revisits=(Revisit(BEGIN_NS + 3 * PERIOD_NS, 0, 9, 2, 80, 0.25, 1.1), Revisit(BEGIN_NS + 9 * PERIOD_NS, 0, 20, 4, 60, 0.0, 2.0, 1)),
+    )
+    metrics = run_metrics(run, load_config("quality"), TIMING)
+    begin = BEGIN_NS / 1e9
+    assert [(round(e["lost_s"] - begin, 2), round(e["found_s"] - begin, 2)) for e in metrics["loss_events"]] == [(0.6, 1.1), (1.4, 1.7)]
+    loop, merge = metrics["loop_events"]
+    assert (loop["kind"], merge["kind"], merge["absorbed_map_id"]) == ("loop", "merge", 1)
+    assert loop["stamp_s"] == pytest.approx(begin + 0.3) and (loop["moved"], loop["scale"], loop["landmarks"]) == (0.25, 1.1, 80)
+    assert json.loads(json.dumps(metrics["loop_events"])) == metrics["loop_events"]

@@ -64,6 +64,7 @@ def test_colcon_finds_the_package() -> None:
     settings = configparser.ConfigParser()
     settings.read(ROOT / "setup.cfg")
     assert settings["install"]["install_scripts"] == settings["develop"]["script_dir"] == "$base/lib/thegra_ros"
+    assert settings["build_scripts"]["executable"] == "/usr/bin/env python3", "colcon's own Python may lack torch"
 
 
 def test_every_module_of_the_core_imports_without_ros() -> None:

@@ -12,10 +12,10 @@ from thegra_core.config import LoopConfig, ThegraConfig
 from thegra_core.geometry import poses
 from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.editor import MapEditor
-from thegra_core.messages import NO_LANDMARK, Features, Keyframe
+from thegra_core.messages import NO_LANDMARK, Features, Keyframe, Matches
 from thegra_core.places.descriptor import as_vectors, describe, learn_vocabulary
 from thegra_core.places.index import PlaceIndex
-from thegra_core.places.verification import Sighting, agree, sight
+from thegra_core.places.verification import Sighting, agree, is_drift, sight
 
 CONFIG = ThegraConfig()
 WORLD = room(seed=3)
@@ -65,6 +65,29 @@ def test_index_gives_places_seen_before_and_nothing_else():
     assert set(found) <= {0, 1, 2, 3}
     assert index.candidates(12, [11, 13, 10, 14, 9, 15]) == []
     assert index.candidates(12, []) == []
+
+
+def test_a_removed_keyframe_is_found_no_more_and_the_others_as_before():
+    index, whole = (PlaceIndex(LoopConfig(vocabulary_keyframes=4, words=32), seed=0) for _ in range(2))
+    yaws = list(range(0, 360, 30))
+    for i, yaw in enumerate(yaws):
+        for one in (index, whole):
+            one.add(i, view(yaw, i))
+    for gone in (3, 11, 5, 99):
+        index.remove(gone)
+    left = [i for i in whole.query(view(92, 50), 99) if i not in (3, 11, 5)]
+    assert index.query(view(92, 50), 99) == left
+    index.add(30, view(91, 51))
+    assert index.query(view(92, 50), 1) == [30]
+    again = PlaceIndex(LoopConfig(), seed=0)
+    again.restore(index.arrays(), {})
+    assert again.query(view(92, 50), 99) == index.query(view(92, 50), 99)
+    waiting = PlaceIndex(LoopConfig(vocabulary_keyframes=4, words=32), seed=0)
+    for i in range(3):
+        waiting.add(i, view(30 * i, i))
+    waiting.remove(1)
+    waiting.add(3, view(90, 3))
+    assert waiting.query(view(0, 9), 9) == [], "three are too few for words"
 
 
 def place_map(scale=1.0, shift=(0.0, 0.0, 0.0)):
@@ -120,3 +143,46 @@ def test_a_keyframe_without_landmarks_of_its_own_tells_no_scale():
     bare = observe(WORLD, look((0.1, 0, 0)), stamp(60))
     editor.add_keyframe(Keyframe(60, stamp(60), look((0.1, 0, 0)), bare, np.full(len(bare), NO_LANDMARK, np.int64), -1, 0))
     assert sight(editor.map, 60, editor.map, [0, 1], FakeMatcher(), CONFIG) == "0 landmarks of both places"
+
+
+def test_a_few_agreeing_landmarks_of_many_that_should_be_seen_are_no_place():
+    """A building that repeats itself: a fifth of the matches fit one pose well, and the rest of what should be there is not."""
+    editor, _ = place_map()
+    strict = CONFIG.model_copy(update={"loop": CONFIG.loop.model_copy(update={"min_inliers": 10, "min_matches": 10})})
+    assert isinstance(sight(editor.map, 10, editor.map, [0, 1, 2], FakeMatcher(), strict), Sighting)
+    features = editor.map.keyframes[10].features
+    few = np.arange(0, len(features), 12)
+    some = replace(features, keypoints=features.keypoints[few], scores=features.scores[few], descriptors=features.descriptors[few])
+    editor.add_keyframe(Keyframe(70, stamp(70), editor.map.keyframes[10].world_from_camera, some, editor.map.keyframes[10].landmark_ids[few], -1, 0))
+    told = sight(editor.map, 70, editor.map, [0, 1, 2], FakeMatcher(), strict)
+    assert isinstance(told, str) and "should be seen from there" in told
+
+
+def straight_map(count: int, step: float) -> MapEditor:
+    editor = MapEditor(0, CAMERA, 15)
+    nothing = replace(view(0, 0), keypoints=np.empty((0, 2), np.float32), scores=np.empty(0, np.float32), descriptors=np.empty((0, 32), np.float32))
+    for i in range(count):
+        editor.add_keyframe(Keyframe(i, stamp(i), look((i * step, 0, 0)), replace(nothing, stamp_ns=stamp(i)), np.empty(0, np.int64), -1, 0))
+    return editor
+
+
+def seen_at(pose, scale=1.0):
+    empty = np.empty(0, np.int64)
+    return Sighting(20, Similarity(pose, scale), empty, empty, {2: Matches(0, 0, np.empty((0, 2), np.int32), np.empty(0, np.float32))})
+
+
+@pytest.mark.parametrize(
+    ("where", "yaw_deg", "scale", "expected"),
+    [
+        ((20.0, 0, 0), 0, 1.0, True),
+        ((16.6, 0, 0), 0, 1.0, True),  # 3.4 of a way of 18: under a fifth
+        ((16.2, 0, 0), 0, 1.0, False),
+        ((16.2, 0, 0), 0, 0.8, True),  # and a drift of scale by 0.8 may move it by 2 more
+        ((2.0, 0, 0), 0, 1.0, False),  # what is seen is where the way began: a corridor with equal doors
+        ((20.0, 0, 0), 19, 1.0, True),
+        ((20.0, 0, 0), 90, 1.0, False),
+    ],
+)
+def test_a_loop_corrects_drift_and_no_more(where, yaw_deg, scale, expected):
+    current = straight_map(21, 1.0).map
+    assert is_drift(current, seen_at(look(where, yaw_deg), scale), CONFIG.loop) is expected

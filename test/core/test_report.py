@@ -14,7 +14,7 @@ import pytest
 from made_runs import BEGIN_NS, PERIOD_NS, SIZE, make_camera, make_run, true_pose
 
 from thegra_core.config import load_config
-from thegra_core.messages import Run
+from thegra_core.messages import Revisit, Run
 from thegra_core.outputs.metrics import Timing
 from thegra_core.outputs.report.timeline import Fate, events, fate_of, stretches
 from thegra_core.outputs.trajectory import format_tum, make_trajectory
@@ -195,9 +195,14 @@ def test_events_are_told_in_order_and_never_too_many() -> None:
     assert "tracking again" in told[5].text
     other = events(make_run("iittllltt", other_map_from=7))
     assert "another map begins, tracking in map 1 (2 frames)" in other[-1].text
+    revisits = (Revisit(BEGIN_NS + 4 * PERIOD_NS, 0, 9, 2, 80, 0.25, 1.1), Revisit(BEGIN_NS + 5 * PERIOD_NS, 0, 20, 4, 60, 0.0, 2.0, 1))
+    tied = events(replace(make_run("iittttll"), revisits=revisits))
+    assert [e.frame for e in tied] == [0, 2, 4, 5, 6]
+    assert "loop closed in map 0: keyframe 9 sees by 80 landmarks what keyframe 2 saw; it moves by 0.250" in tied[2].text
+    assert "map 1 becomes part of map 0" in tied[3].text
     many = events(make_run("tl" * 100))
     assert len(many) == 61
-    assert many[-1].text == "... and 140 more changes of state"
+    assert many[-1].text == "... and 140 more"
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
@@ -101,7 +103,7 @@ def test_the_extractor_sees_the_preprocessed_image() -> None:
     slam = make(walk_world(), WALK)
     image = (picture(0).astype(np.uint16) * 3 + 20000).astype(np.uint16)
     slam.process(Frame(stamp(0), 0, image))
-    (given,) = slam._extractor.images  # type: ignore[attr-defined]
+    (given,) = slam._extractor._inner.images  # type: ignore[attr-defined]
     assert given.dtype == np.uint8 and given.shape == (HEIGHT, WIDTH)
     assert given.min() == 0 and given.max() == 255
 
@@ -118,7 +120,7 @@ def test_a_kidnapped_camera_relocalises_when_it_is_put_back() -> None:
     far = World(walk_world().points + [0, 0, 500], walk_world().descriptors, walk_world().scores)
     slam = make(walk_world(), path)
     for i in range(25, 29):
-        del slam._extractor.poses_by_stamp[stamp(i)]  # type: ignore[attr-defined]
+        del slam._extractor._inner.poses_by_stamp[stamp(i)]  # type: ignore[attr-defined]
     results, run = play(slam, frames(40))
     assert len(far.points) and {r.state for r in results[25:29]} == {TrackingState.LOST}
     assert {r.state for r in results[29:]} == {TrackingState.TRACKING}
@@ -278,7 +280,7 @@ def test_few_keypoints_never_crash() -> None:
     """A world of a handful of points: not enough for a map, at any number."""
     for count in (1, 3, 8, 20):
         slam = make(cloud(count=count, seed=3), WALK)
-        slam._extractor.clutter = 0  # type: ignore[attr-defined]
+        slam._extractor._inner.clutter = 0  # type: ignore[attr-defined]
         _, run = play(slam, frames(6))
         assert run.main_map_id == -1
 
@@ -320,3 +322,23 @@ def test_noise_of_the_front_end_is_repeatable() -> None:
     a, b = (observe(walk_world(), WALK[3], stamp(3)) for _ in range(2))
     assert a.keypoints.tobytes() == b.keypoints.tobytes()
     assert Shutter.OPEN is not Shutter.CLOSED
+
+
+def test_a_system_that_is_given_up_gives_its_memory_back() -> None:
+    """What a reset does: the old system goes, another begins. Nothing may hold on to the old map."""
+    stream = frames(30)
+    play(make(walk_world(), WALK), stream[:12])  # what is loaded once for all
+    tracemalloc.start()
+    try:
+        gc.collect()
+        before = tracemalloc.get_traced_memory()[0]
+        slam = make(walk_world(), WALK)
+        for frame in stream:
+            slam.process(frame)
+        held = tracemalloc.get_traced_memory()[0] - before
+        del slam
+        gc.collect()
+        left = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert held > 1 << 20 and left < 0.05 * held

@@ -13,6 +13,7 @@ from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.messages import Features, MapUpdate, TrackingState
+from thegra_core.optimization.solver import BundleSolver
 from thegra_core.tracking.motion import MotionModel
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
 
@@ -22,10 +23,10 @@ CONFIG = ThegraConfig()
 class Pair:
     """Tracking and mapping as `Slam` wires them, with every output kept."""
 
-    def __init__(self, config: ThegraConfig = CONFIG, matcher: FakeMatcher | None = None) -> None:
+    def __init__(self, config: ThegraConfig = CONFIG, matcher: FakeMatcher | None = None, solver: BundleSolver | None = None) -> None:
         self.matcher = matcher or FakeMatcher()
         self.tracking = TrackingStage(CAMERA, config, self.matcher)
-        self.mapper = Mapper(CAMERA, config, self.matcher)
+        self.mapper = Mapper(CAMERA, config, self.matcher, solver)
         self.outputs: list[TrackingOutput] = []
         self.updates: list[MapUpdate] = []
 

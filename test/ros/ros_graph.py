@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -29,12 +29,16 @@ from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame
 from thegra_ros.codec.images import camera_info_message, image_message
 from thegra_ros.codec.stamps import header
+from thegra_ros.lifecycle import ManagedNode
 from thegra_ros.qos import LATCHED, LOSSLESS, RELIABLE
 
+NodeT = TypeVar("NodeT", bound=ManagedNode)
 LIMIT_S = float(os.environ.get("THEGRA_TEST_LIMIT_S", "120"))
 NAMESPACE = "/thegra"
 FAST = {"profile": "fast", "extractor.name": "orb", "preprocessing.filters": "he_clip", "loop.enabled": "false"}
 """Parameters with which no network is needed, and a frame takes a tenth of a second."""
+OFFLINE = {name: "[{filter: he_clip}]" if name == "preprocessing.filters" else value for name, value in FAST.items() if name != "profile"}
+"""The same as overrides of a configuration."""
 EVERY_IMAGE = {f"qos_overrides.{NAMESPACE}/image_raw.subscription.reliability": "reliable", f"qos_overrides.{NAMESPACE}/image_raw.subscription.depth": "1000", "queue_size": "1000"}
 
 
@@ -80,6 +84,7 @@ class Graph:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._processes: list[NodeProcess] = []
+        self._nodes: list[ManagedNode] = []
         self._images = self.node.create_publisher(Image, "image_raw", LOSSLESS)
         self._infos = self.node.create_publisher(CameraInfo, "camera_info", RELIABLE)
         self.received: dict[str, list[Any]] = {}
@@ -96,6 +101,18 @@ class Graph:
         process = NodeProcess(module, {**FAST, **EVERY_IMAGE, **(parameters or {})}, self.environment, log, extra)
         self._processes.append(process)
         return process
+
+    def add(self, make: Callable[..., NodeT]) -> NodeT:
+        """A node in the test's own process, worked on while the test waits."""
+        made = make(context=self._context, namespace=NAMESPACE)
+        self._executor.add_node(made)
+        self._nodes.append(made)
+        return made
+
+    def forget(self, process: NodeProcess) -> None:
+        """It was killed by the test."""
+        process.close()
+        self._processes.remove(process)
 
     def listen(self, kind: type, topic: str, qos: Any) -> list[Any]:
         kept = self.received.setdefault(topic, [])
@@ -178,6 +195,10 @@ class Graph:
     def close(self) -> None:
         for process in self._processes:
             process.close()
+        for node in self._nodes:
+            node.end()
+            self._executor.remove_node(node)
+            node.destroy_node()
         self._executor.shutdown()
         self.node.destroy_node()
         self._context.shutdown()

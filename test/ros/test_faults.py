@@ -57,6 +57,25 @@ def test_bad_input_is_said_and_survived(graph: Graph, frames, camera: CameraMode
     assert node.end() == 0
 
 
+@pytest.mark.slow
+def test_a_camera_that_stops_and_returns(graph: Graph, frames, camera) -> None:
+    node = graph.start()
+    graph.wait_for_listener()
+    graph.send_camera(camera)
+    graph.send(frames[:20])
+    graph.wait(lambda: graph.processed() == 20)
+    before = len(graph.received["pose"])
+    assert before > 3
+    graph.wait(lambda: graph.heard(DiagnosticStatus.WARN, "no image for"), "a word about the silence")
+    assert len(graph.received["pose"]) == before, "no pose without an image"
+    seen_again = [replace(frame, stamp_ns=frame.stamp_ns + 60 * 10**9) for frame in frames[16:22]]
+    graph.send(seen_again)
+    graph.wait(lambda: graph.processed() == 26)
+    assert len(graph.received["pose"]) >= before + 3 and graph.value("map") == "0"
+    assert "new map" not in node.output
+    assert node.end() == 0
+
+
 def replace_matrix(camera: CameraModel, factor: float) -> CameraModel:
     made = CameraModel(camera.matrix, camera.distortion, camera.model, camera.image_size, camera.name)
     object.__setattr__(made, "matrix", camera.matrix * factor)  # the model itself refuses such a matrix
@@ -95,8 +114,8 @@ def test_lifecycle_requests_that_are_invalid_end_nothing(graph: Graph, frames, c
         graph.wait_for_listener()
         graph.send_camera(camera)
         before = len(graph.received["pose"])
-        graph.send(frames[:12])
-        graph.wait(lambda: graph.processed() == 12)
+        graph.send(frames[:16])
+        graph.wait(lambda: graph.processed() == 16)
         assert len(graph.received["pose"]) > before
         assert graph.change_state(Transition.TRANSITION_DEACTIVATE)
         assert graph.change_state(Transition.TRANSITION_CLEANUP)

@@ -14,6 +14,7 @@ from thegra_core.config import PROFILES, Median, load_config
 from thegra_core.errors import ConfigError
 from thegra_ros.camera_place import frames_of
 from thegra_ros.node_config import NodeConfig
+from thegra_ros.parameter_table import table
 from thegra_ros.parameters import Declared, declared, from_ros
 
 
@@ -77,6 +78,13 @@ def test_the_parameter_file_that_ships_is_understood() -> None:
     known = {p.name for p in [*declared(load_config()), *declared(NodeConfig())]} | {"profile", "config_file", "autostart", "use_sim_time"}
     flat = dict(_flatten(values))
     assert flat and set(flat) - known == set()
+
+
+def test_the_table_of_parameters_is_that_of_the_model() -> None:
+    written = (Path(__file__).resolve().parents[2] / "docs" / "parameters.md").read_text()
+    assert written == table(), "renew it: python -m thegra_ros.parameter_table > docs/parameters.md"
+    for parameter in [*declared(load_config()), *declared(NodeConfig())]:
+        assert f"`{parameter.name}`" in written
 
 
 def _flatten(values: dict, prefix: str = ""):

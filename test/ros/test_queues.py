@@ -54,6 +54,18 @@ def test_what_is_cleared_does_not_count_as_dropped() -> None:
     assert (len(queue), queue.dropped) == (0, 0)
 
 
+def test_what_is_put_first_is_never_dropped() -> None:
+    queue: LatestQueue[int] = LatestQueue(1)
+    queue.put(1)
+    assert queue.put_first(-1) and queue.put_first(-2)
+    queue.put(2)
+    queue.clear()
+    queue.put(3)
+    assert [queue.get() for _ in range(2)] == [-1, -2]
+    assert queue.get() == 3 and queue.put_first(-3)
+    assert queue.close() == [-3] and not queue.put_first(-4)
+
+
 def told(stamps: list[int]) -> list[int]:
     """Indices at which the stream begins anew."""
     watch = StampWatch()

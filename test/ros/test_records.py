@@ -14,7 +14,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from thegra_core.config import load_config
 from thegra_core.features.registry import make_extractor, make_matcher
 from thegra_core.mapping.mapper import Mapper
-from thegra_core.messages import Absorbed, Features, MapUpdate
+from thegra_core.messages import Absorbed, Features, MapUpdate, RemovedKeyframe, Revisit
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.tracking.stage import TrackingStage
 from thegra_ros.codec.records import (
@@ -97,8 +97,9 @@ def test_records_are_exact(records) -> None:
 
 def test_updates_of_loops_are_exact() -> None:
     update = MapUpdate(
-        7, 2, removed_keyframe_ids=(3, 5), removed_landmark_ids=np.array([1, 9], np.int64), covisibility={4: ((1, 20), (2, 17)), 6: ()},
+        7, 2, removed_keyframes=(RemovedKeyframe(3, 2**60 + 1, 4, np.random.default_rng(1).normal(size=(4, 4))),), removed_landmark_ids=np.array([1, 9], np.int64), covisibility={4: ((1, 20), (2, 17)), 6: ()},
         absorbed=Absorbed(5, np.random.default_rng(0).normal(size=(4, 4)), 1.7), scales={4: 1.25, 6: 0.1},
+        revisits=(Revisit(2**60 + 3, 2, 8, 4, 77, 0.1, 1.0 / 3), Revisit(5, 2, 9, 4, 50, 0.0, 0.7, 5)),
     )  # fmt: skip
     assert same(tables_update(send(update_tables(update))), update)
 

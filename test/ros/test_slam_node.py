@@ -10,7 +10,7 @@ import signal
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_graph import FAST, Graph
+from ros_graph import OFFLINE, Graph
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool, Trigger
 
@@ -24,8 +24,6 @@ from thegra_ros.codec.poses import path_poses, pose_matrix
 from thegra_ros.codec.stamps import stamp_ns
 from thegra_ros.qos import RELIABLE
 from thegra_ros.transforms import Frames, map_pose
-
-OFFLINE = {name: "[{filter: he_clip}]" if name == "preprocessing.filters" else value for name, value in FAST.items() if name != "profile"}
 
 
 def test_poses_are_those_of_the_offline_run(graph: Graph, frames, camera, recording_path) -> None:

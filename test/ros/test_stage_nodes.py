@@ -6,27 +6,38 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ros]")
 
-from collections.abc import Iterator
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from ros_graph import Graph
+from rcl_interfaces.srv import SetParameters
+from ros_graph import OFFLINE, Graph, set_parameter
+from stages import Stages, again, value
+from std_srvs.srv import SetBool, Trigger
 
-from thegra_core.messages import Frame, Shutter, ShutterState
+from thegra_core.config import load_config
+from thegra_core.messages import Shutter, ShutterState, TrackingState
 from thegra_core.outputs.scoring import align
 from thegra_core.outputs.trajectory import read_tum
+from thegra_core.slam import Slam
+from thegra_ros.codec.poses import pose_matrix
 from thegra_ros.codec.shutter import FrameNotice, notice_message, read_notice
 from thegra_ros.codec.stamps import stamp_ns
-from thegra_ros.joiner import FrameJoiner
-
-STAGES = ("preprocessing", "frontend", "tracking", "mapping")
+from thegra_ros.joiner import MOST_PENDING, FrameJoiner
+from thegra_ros.transforms import Frames, map_pose
 
 
 @given(st.integers(0, 2**31 * 10**9 - 1), st.sampled_from(Shutter), st.text(st.characters(codec="utf-8", exclude_characters="\0")), st.booleans(), st.integers(0, 99))
 def test_notices_are_exact(stamp: int, shutter: Shutter, reason: str, recalibrated: bool, epoch: int) -> None:
     notice = FrameNotice(ShutterState(stamp, shutter, reason, recalibrated), epoch, "thermal_camera")
     assert read_notice(notice_message(notice)) == notice
+
+
+def test_what_nothing_announces_is_forgotten() -> None:
+    joined = joiner()
+    for stamp in range(3 * MOST_PENDING):
+        assert joined.add("features", stamp, "f") == []
+    assert joined.lost == 2 * MOST_PENDING
 
 
 def joiner() -> FrameJoiner:
@@ -51,39 +62,19 @@ def test_a_frame_that_lost_a_part_holds_nothing_up() -> None:
     assert joined.lost == 1
 
 
-def value(graph: Graph, node: str, key: str) -> int:
-    """What a node last said on /diagnostics."""
-    for message in reversed(graph.received["/diagnostics"]):
-        if message.status[0].name.endswith(node):
-            return int(next((v.value for v in message.status[0].values if v.key == key), "0"))
-    return 0
-
-
-def noisy_copies(frame: Frame) -> Iterator[Frame]:
-    """Images of a camera that stands still, before the frame's time."""
-    rng = np.random.default_rng(0)
-    for step in range(600):
-        noise = rng.normal(0, 5, frame.image.shape)
-        yield Frame(frame.stamp_ns - (600 - step) * 100_000_000, 0, (frame.image + noise).astype(np.uint16))
-
-
 @pytest.mark.slow
 def test_four_nodes_track_and_survive(graph: Graph, frames, camera, recording_path) -> None:
-    nodes = {name: graph.start(f"thegra_ros.nodes.{name}") for name in STAGES}
-    graph.wait(lambda: all(any(m.status[0].name.endswith(name) and m.status[0].message != "the node is not active" for m in graph.received["/diagnostics"]) for name in STAGES), "four nodes")
-    graph.send_camera(camera, listeners=2)
-    warm_up = iter(noisy_copies(frames[0]))  # a stream finds its listeners; what is sent before is lost
-    while value(graph, "tracking", "processed") == 0:
-        graph.send([next(warm_up)])
-        graph.spin_for(1.0)
+    stages = Stages(graph, camera, frames[0])
     begin = value(graph, "preprocessing", "images")
     lost = value(graph, "tracking", "lost parts")
-    for count, frame in enumerate(frames, 1):  # in step, so that each frame is matched to the newest reference
-        done = value(graph, "tracking", "processed")
-        graph.send([frame])
-        graph.wait(lambda n=done: value(graph, "tracking", "processed") > n, f"frame {count}")
+    stages.send(frames)
     live = {stamp_ns(m): m for m in graph.received["pose"]}
     assert len(live) > 15 and set(live) <= {f.stamp_ns for f in frames}
+    slam = Slam(camera, load_config("fast", overrides=OFFLINE))
+    alone = {r.stamp_ns: r for r in map(slam.process, frames) if r.state is TrackingState.TRACKING}
+    assert set(alone) == set(live)
+    for stamp, message in live.items():
+        np.testing.assert_allclose(pose_matrix(message.pose.pose), map_pose(alone[stamp].world_from_camera, Frames()), atol=1e-9)
     t = read_tum(recording_path.parent / "bag" / "groundtruth.txt")
     truth = dict(zip(t.stamps_ns.tolist(), t.poses[:, :3, 3], strict=True))
     found = np.array([[m.pose.pose.position.x, m.pose.pose.position.y, m.pose.pose.position.z] for m in live.values()])
@@ -94,9 +85,50 @@ def test_four_nodes_track_and_survive(graph: Graph, frames, camera, recording_pa
     assert value(graph, "tracking", "lost parts") == lost and value(graph, "mapping", "broken records") == 0
 
     before = len(graph.received["pose"])  # the bag begins again
-    for count, frame in enumerate(frames[:14], 1):
+    for count, frame in enumerate(frames[:18], 1):
         graph.send([frame])
         graph.wait(lambda n=count: value(graph, "preprocessing", "images") >= begin + len(frames) + n, f"frame {count} again")
     graph.wait(lambda: len(graph.received["pose"]) > before, "poses of a new map")
-    assert nodes["preprocessing"].output.count("begins anew") == 1
-    assert [node.end() for node in nodes.values()] == [0, 0, 0, 0]
+    assert stages.nodes["preprocessing"].output.count("begins anew") == 2
+    assert stages.end() == [0, 0, 0, 0]
+
+
+@pytest.mark.slow
+def test_a_node_that_is_killed_and_started_again_is_taken_back(graph: Graph, frames, camera, tmp_path) -> None:
+    stages = Stages(graph, camera, frames[0])
+    stages.send(frames[:20])
+    poses = {stamp_ns(m): m for m in graph.received["pose"]}
+    assert len(poses) > 3
+    maps = stages.value("mapping", "maps")
+
+    kept = tmp_path / "room.map"
+    for node in ("mapping",):
+        assert graph.call(SetParameters, f"{node}/set_parameters", SetParameters.Request(parameters=[set_parameter("map_file", str(kept))])).results[0].successful
+    answer = graph.call(Trigger, "mapping/save_map", Trigger.Request())
+    assert answer.success and kept.is_file(), answer.message
+
+    for name in ("tracking", "frontend", "preprocessing"):
+        stages.restart(name, camera)
+        before = len(graph.received["pose"])
+        resent = iter([f for _ in range(30) for f in again(frames[20:24])] if name == "preprocessing" else again(frames[20:24] * 10))
+        while len(graph.received["pose"]) < before + 2:
+            graph.send([next(resent)])
+            graph.spin_for(1.0)
+        assert value(graph, "mapping", "maps") == maps, "no new map was begun"
+    assert "sought in the map" in stages.nodes["tracking"].output
+
+    stages.restart("mapping", camera)  # it owned the map: a new one begins
+    before = len(graph.received["pose"])
+    resent = iter(again(frames * 3))
+    while "a new map begins" not in stages.nodes["tracking"].output:
+        graph.send([next(resent)])
+        graph.spin_for(1.0)
+    assert graph.call(SetParameters, "mapping/set_parameters", SetParameters.Request(parameters=[set_parameter("map_file", str(kept))])).results[0].successful
+    answer = graph.call(Trigger, "mapping/load_map", Trigger.Request())
+    assert answer.success, answer.message
+    resent = iter(again(frames[14:22] * 5))
+    while len(graph.received["pose"]) < before + 3:
+        graph.send([next(resent)])
+        graph.spin_for(1.0)
+    assert graph.call(SetBool, "tracking/localization_only", SetBool.Request(data=True)).success
+    assert stages.end() == [0, 0, 0, 0]

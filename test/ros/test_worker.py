@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from thegra_core.config import load_config
-from thegra_core.errors import WeightsError
+from thegra_core.errors import InputError, WeightsError
 from thegra_core.messages import Frame, TrackingResult, TrackingState
 from thegra_core.simulation.cameras import thermal_camera
-from thegra_ros.engine import Done, EngineError, Job, LocalEngine
-from thegra_ros.worker import MOST_FAILURES, Worker
+from thegra_ros.engine import Done, EngineError, Job, LocalEngine, Order, SaveMap
+from thegra_ros.image_slot import MOST_BYTES, make_slot, put, take
+from thegra_ros.worker import MOST_FAILURES, NotWorkingError, Worker
 
 LIMIT_S = 60
 
@@ -34,6 +37,14 @@ class FakeEngine:
             raise failure
         return Done(TrackingResult(job.frame.stamp_ns, TrackingState.LOST))
 
+    def obey(self, order: Order) -> str:
+        assert isinstance(order, SaveMap)
+        if order.path.name == "refused":
+            raise InputError("no map yet")
+        if order.path.name == "fails":
+            raise EngineError("killed")
+        return f"written to {order.path}"
+
     def stop(self) -> None:
         self.stopped += 1
 
@@ -44,6 +55,7 @@ class Harness:
     def __init__(self, *engines: FakeEngine) -> None:
         self.engines, self.made = list(engines), 0
         self.done: list[int] = []
+        self.unwanted: set[int] = set()
         self.failures: list[tuple[str, bool]] = []
         self.changed = threading.Condition()
         self.worker: Worker[int] = Worker(self._make, 100, self._job, self._on_done, self._on_failure)
@@ -53,7 +65,9 @@ class Harness:
         self.made += 1
         return self.engines[self.made - 1]
 
-    def _job(self, item: int) -> Job:
+    def _job(self, item: int) -> Job | None:
+        if item in self.unwanted:
+            return None
         return Job(Frame(item, item, np.zeros((2, 2), np.uint8)), thermal_camera((2, 2)), 0)
 
     def _on_done(self, item: int, done: Done, ms: float) -> None:
@@ -105,11 +119,38 @@ def test_what_the_user_must_put_right_is_not_tried_again() -> None:
     assert harness.failures == [("fetch them", True)] and harness.made == 1
 
 
+def test_orders_are_answered_and_a_refused_one_changes_nothing() -> None:
+    harness = Harness(FakeEngine(), FakeEngine())
+    happened: list[str] = []
+    assert harness.worker.ask(SaveMap(Path("/a/map")), lambda: happened.append("then")).result(LIMIT_S) == "written to /a/map"
+    with pytest.raises(InputError, match="no map yet"):
+        harness.worker.ask(SaveMap(Path("/a/refused")), lambda: happened.append("never")).result(LIMIT_S)
+    assert happened == ["then"] and harness.made == 1
+    with pytest.raises(EngineError, match="killed"):
+        harness.worker.ask(SaveMap(Path("/a/fails"))).result(LIMIT_S)
+    harness.unwanted.add(1)
+    for item in (1, 2):
+        harness.worker.queue.put(item)
+    harness.wait(lambda: harness.done == [2])
+    assert harness.made == 2, "what failed was replaced"
+    harness.worker.stop()
+    with pytest.raises(NotWorkingError):
+        harness.worker.ask(SaveMap(Path("/a/map"))).result(LIMIT_S)
+
+
+def test_orders_that_wait_when_the_engine_is_given_up_are_refused() -> None:
+    harness = Harness(FakeEngine(start=WeightsError("fetch them")))
+    with pytest.raises(NotWorkingError, match="diagnostics"):
+        harness.worker.ask(SaveMap(Path("/a/map"))).result(LIMIT_S)
+    harness.worker.stop()
+
+
 def test_another_epoch_begins_a_new_map(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[object] = []
 
     class FakeSlam:
-        def __init__(self, camera, config, *networks) -> None:
+        def __init__(self, camera, config, *networks, keep_records=True) -> None:
+            assert not keep_records, 'a live stream has no end'
             made.append(networks)
 
         def process(self, frame: Frame) -> TrackingResult:
@@ -128,3 +169,20 @@ def test_another_epoch_begins_a_new_map(monkeypatch: pytest.MonkeyPatch) -> None
         engine.process(Job(Frame(9, 9, np.zeros((2, 2), np.uint8)), camera, 1))
     engine.process(Job(Frame(10, 10, np.zeros((2, 2), np.uint8)), camera, 1))
     assert len(made) == 3, "what failed may be in any state"
+
+
+@pytest.mark.parametrize("image", [np.arange(12, dtype=np.uint16).reshape(3, 4), np.arange(24, dtype=np.float32).reshape(4, 6)[::2, ::3], np.zeros((0, 5), np.uint8)])
+def test_an_image_comes_out_of_the_slot_as_it_was_put(image: np.ndarray) -> None:
+    slot = make_slot(multiprocessing.get_context("spawn"))
+    put(slot, Frame(1, 0, np.full((9, 9), 7, np.uint16)))
+    left = put(slot, Frame(2, 5, image))
+    taken = take(slot, left)
+    put(slot, Frame(3, 1, np.full((9, 9), 7, np.uint16)))
+    assert (taken.stamp_ns, taken.index, taken.image.dtype) == (2, 5, image.dtype)
+    np.testing.assert_array_equal(taken.image, image)
+
+
+def test_an_image_without_room_in_the_slot_goes_as_it_is() -> None:
+    slot = make_slot(multiprocessing.get_context("spawn"))
+    large = Frame(2, 5, np.zeros((MOST_BYTES // 1000 + 1, 1000), np.uint8))
+    assert put(slot, large) is large and take(slot, large) is large

@@ -88,3 +88,49 @@ def test_the_way_back_stays_in_one_map(shared_data: Path, name: str) -> None:
     depth = 1.0  # the median depth of a new map
     beginning, end = poses[there[0].index], poses[there[0].index + 100_000]
     assert np.linalg.norm(beginning[:3, 3] - end[:3, 3]) < 0.05 * depth, "the way back ends where the way there began"
+
+
+def of_size(frames: list[Frame], size: tuple[int, int]) -> list[Frame]:
+    """The middle of each image, with its edge repeated where the image is too small."""
+    made = []
+    for frame in frames:
+        image = frame.image
+        for axis, wanted in ((0, size[1]), (1, size[0])):
+            spare = image.shape[axis] - wanted
+            if spare > 0:
+                image = np.take(image, np.arange(spare // 2, spare // 2 + wanted), axis=axis)
+            elif spare < 0:
+                width = [(0, 0), (0, 0)]
+                width[axis] = (-spare // 2, -spare - -spare // 2)
+                image = np.pad(image, width, mode="edge")
+        made.append(replace(frame, image=np.ascontiguousarray(image)))
+    return made
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(PATIENCE_S)
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("forest_f0", "forest_f6_line1"),  # two forests without leaves
+        ("forest_f6_line1", "orchard_m2ea_drone"),
+        ("kitchen_rgb_7scenes", "sim_room_shutter"),  # two rooms
+        ("sim_room_shutter", "forest_f0"),
+        ("sim_corridor_loop", "sim_rotation_only"),
+    ],
+)
+def test_two_places_in_one_recording_stay_two(shared_data: Path, one: str, other: str) -> None:
+    camera, first = recorded(shared_data / one)
+    second = of_size(recorded(shared_data / other)[1], camera.image_size)
+    if second[0].image.dtype != first[0].image.dtype:
+        first, second = ([replace(f, image=f.image.astype(np.float32)) for f in part] for part in (first, second))
+    period_ns = int(np.median(np.diff([f.stamp_ns for f in first])))
+    border_ns = first[-1].stamp_ns + period_ns
+    slam = Slam(camera, load_config("quality"))
+    for frame in [*first, *later(second, border_ns, period_ns)]:
+        slam.process(frame)
+    run = slam.finish()
+    assert run.merges == 0
+    for each in run.maps:
+        beyond = each.keyframe_stamps_ns >= border_ns
+        assert beyond.all() or not beyond.any(), "a map of two places"

@@ -64,6 +64,7 @@ def figures(recording: Path, out: Path, max_frames: int | None = None, profile: 
         ("quality", "sim_room_shutter", 97, 0.05),
         ("quality", "forest_f6_line1", 93, 0.25),
         ("quality", "forest_f0", 90, 0.3),
+        ("quality", "orchard_m2ea_drone", 90, 6.0),  # there and back over the ground, with turns of 90 degrees between two frames
         ("paper", "kitchen_rgb_7scenes", 95, 0.045),
         ("paper", "sim_room_shutter", 97, 0.06),
         ("paper", "forest_f6_line1", 93, 0.3),

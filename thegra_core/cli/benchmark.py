@@ -156,6 +156,46 @@ def preprocessing(
     print(f"the paper's chain: {content['chain']['within_one_level_pct']:.3f} % of the pixels within one grey level of the reference")
 
 
+@app.command("growth")
+def growth(
+    minutes: Annotated[float, typer.Option(min=0.1, metavar="MIN", help="Length of the walk.")] = 10.0,
+    keypoints: Annotated[int, typer.Option(min=100, metavar="N", help="Keypoints of a frame, about.")] = 300,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for growth.json and growth.png. Default: runs/growth_TIME.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter; repeatable. `thegra config` lists them.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Time tracking and mapping while the map grows: a walk through new places, made of points instead of images.
+
+    Example: `thegra benchmark growth --minutes 10 --out runs/growth`
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from thegra_core.config import load_config
+    from thegra_core.evaluation.benchmark import growth as logic
+
+    config = load_config("quality", overrides={"preprocessing.filters": "[]"} | dict(_assignment(text) for text in set_ or ()))
+    folder = out or Path("runs") / f"growth_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("walking", total=None)
+        samples = logic.walk(config, minutes, keypoints, lambda done, total: bar.update(task, completed=done, total=total))
+    logic.write(samples, folder)
+    told = logic.summary(samples)
+    if as_json:
+        print(json.dumps(told, indent=2))
+        return
+    for name, value in told.items():
+        print(f"{name:18} {value}")
+    print(f"figure             {folder / 'growth.png'}")
+
+
+def _assignment(text: str) -> tuple[str, str]:
+    key, separator, value = text.partition("=")
+    if not separator:
+        raise ConfigError(f"--set {text}: write KEY=VALUE")
+    return key, value
+
+
 def _frames_of(recordings: Sequence[Path], count: int) -> list[ImageArray]:
     import numpy as np
 

@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 
 from thegra_core.cli import exit_codes
 from thegra_core.cli.benchmark import app as benchmark_app
-from thegra_core.cli.extensions import add_commands
+from thegra_core.cli.extensions import BENCHMARKS, add_commands
 from thegra_core.cli.weights import app as weights_app
 from thegra_core.errors import ThegraError
 from thegra_core.process import keep_freed_memory
@@ -327,6 +327,7 @@ def simulate(
 app.add_typer(weights_app, name="weights")
 app.add_typer(benchmark_app, name="benchmark")
 add_commands(app)
+add_commands(benchmark_app, BENCHMARKS)
 
 
 if __name__ == "__main__":

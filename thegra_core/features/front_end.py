@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -95,7 +95,7 @@ class DetectAndFollow:
         old = before.features
         assert old.track_ids is not None
         scores = old.scores[chosen] * result.similarity[chosen]
-        return Features(stamp_ns, result.points[chosen], scores, old.descriptors[chosen], old.image_size, old.extractor, old.track_ids[chosen])
+        return Features(stamp_ns, result.points[chosen], scores, old.descriptors[chosen], old.image_size, old.extractor, old.track_ids[chosen], old.turns)
 
     def _numbered(self, features: Features) -> Features:
         """Give a number to each keypoint that has none."""
@@ -103,7 +103,7 @@ class DetectAndFollow:
         new = np.flatnonzero(ids < 0)
         ids[new] = np.arange(self._next_id, self._next_id + len(new))
         self._next_id += len(new)
-        return Features(features.stamp_ns, features.keypoints, features.scores, features.descriptors, features.image_size, features.extractor, ids)
+        return replace(features, track_ids=ids)
 
 
 def merged(followed: Features, detected: Features, near_px: float, most: int) -> Features:
@@ -129,6 +129,7 @@ def merged(followed: Features, detected: Features, near_px: float, most: int) ->
         detected.image_size,
         detected.extractor,
         np.concatenate((followed.track_ids, np.full(len(new), -1, np.int64))),
+        detected.turns,
     )
 
 

@@ -15,8 +15,10 @@ from thegra_core.messages import Features, Matches
 class Extractor(Protocol):
     """Finds keypoints and describes them."""
 
-    name: str
-    """Registry name; `Features.extractor` of what it returns."""
+    @property
+    def name(self) -> str:
+        """Registry name; `Features.extractor` of what it returns."""
+        ...
 
     def extract(self, image: NDArray[np.uint8], stamp_ns: int) -> Features:
         """Features of a single-channel image (H, W) uint8, at most `max_keypoints`, strongest first; none at all is a valid answer."""
@@ -26,7 +28,10 @@ class Extractor(Protocol):
 class Matcher(Protocol):
     """Pairs the features of two frames."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Registry name."""
+        ...
 
     def match(self, query: Features, reference: Features) -> Matches:
         """One-to-one matches of two feature sets of the same extractor, sorted by query index; empty if either set is empty."""

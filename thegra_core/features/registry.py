@@ -74,8 +74,9 @@ def make_frame_matcher(config: ThegraConfig, matcher: Matcher | None = None) -> 
         ConfigError, WeightsError: As `make_matcher`.
     """
     from thegra_core.features.tracks import TrackMatcher
+    from thegra_core.features.turning import TurningMatcher
 
-    learned = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
+    learned = TurningMatcher(matcher if matcher is not None else make_matcher(config.matcher, config.extractor))
     return TrackMatcher(learned, config.flow.min_shared) if config.flow.enabled else learned
 
 

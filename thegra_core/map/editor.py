@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.map import Map, make_keyframes
-from thegra_core.messages import NO_LANDMARK, Absorbed, Keyframe, KeyframeState, LandmarkArrays, MapUpdate
+from thegra_core.messages import NO_LANDMARK, Absorbed, Keyframe, KeyframeState, LandmarkArrays, MapUpdate, RemovedKeyframe, Revisit
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -37,6 +37,8 @@ class MapEditor:
         self._keyframes: set[int] = set()
         self._landmarks: set[int] = set()
         self._removed: set[int] = set()
+        self._removed_keyframes: dict[int, RemovedKeyframe] = {}
+        self._revisits: list[Revisit] = []
         self._edges: set[int] = set()
         self._scales: dict[int, float] = {}
 
@@ -89,6 +91,28 @@ class MapEditor:
         self._keyframes.add(message.id)
         for index in np.flatnonzero(self.map.landmarks.rows(wanted) >= 0):
             self.observe(int(wanted[index]), message.id, int(index))
+
+    def remove_keyframe(self, keyframe_id: int) -> None:
+        """Take out a keyframe with its observations; its best neighbour, or else the nearest id, inherits what is placed beside it.
+
+        Landmarks left with fewer than two observations are removed. The last keyframe of a map cannot be removed.
+        """
+        keyframe = self.map.keyframes[keyframe_id]
+        for landmark in keyframe.landmark_ids[keyframe.landmark_ids != NO_LANDMARK].tolist():
+            self.forget_observation(landmark, keyframe_id)
+        neighbours = self.map.neighbours(keyframe_id, 1) or [min((i for i in self.map.keyframes if i != keyframe_id), key=lambda i: abs(i - keyframe_id))]
+        heir = self.map.keyframes[neighbours[0]]
+        heir_from_removed = heir.camera_from_world @ keyframe.world_from_camera
+        for earlier in [r for r in self._removed_keyframes.values() if r.heir_id == keyframe_id]:
+            self._removed_keyframes[earlier.id] = replace(earlier, heir_id=heir.id, heir_from_removed=heir_from_removed @ earlier.heir_from_removed)
+        self._removed_keyframes[keyframe_id] = RemovedKeyframe(keyframe_id, keyframe.stamp_ns, heir.id, heir_from_removed)
+        del self.map.keyframes[keyframe_id]
+        for other, _ in self.map.covisibility.pop(keyframe_id, ()):
+            self.map.covisibility[other] = tuple(item for item in self.map.covisibility[other] if item[0] != keyframe_id)
+            self._edges.add(other)
+        self._new = [message for message in self._new if message.id != keyframe_id]
+        self._keyframes.discard(keyframe_id)
+        self._edges.discard(keyframe_id)
 
     def add_landmarks(self, points_world: FloatArray, keyframe_id: int) -> IntArray:
         """New ids (N,) for points (N, 3), without observations yet; `keyframe_id` is where they were first seen."""
@@ -174,6 +198,10 @@ class MapEditor:
         for keyframe_id, scale in scales.items():
             self._scales[keyframe_id] = self._scales.get(keyframe_id, 1.0) * scale
 
+    def note(self, revisit: Revisit) -> None:
+        """Tell with the next update that a place was seen again."""
+        self._revisits.append(revisit)
+
     def absorb(self, other: MapEditor, self_from_other: Similarity) -> dict[int, int]:
         """Take in all of another map, whose world this one sees by `self_from_other`; its landmarks get the new ids that are returned.
 
@@ -194,13 +222,19 @@ class MapEditor:
             keyframe.world_from_camera = (self_from_other @ Similarity(keyframe.world_from_camera)).rigid
             self.map.keyframes[keyframe.id] = keyframe
         self.map.covisibility.update(other.map.covisibility)
+        self.touch_all()
+        self._removed_keyframes.update(other._removed_keyframes)
+        self._revisits.extend(other._revisits)
+        return renamed
+
+    def touch_all(self) -> None:
+        """Let all of the map count as changed, as a replica that begins needs it."""
         self._new = [
             Keyframe(k.id, k.stamp_ns, k.world_from_camera, k.features, k.landmark_ids, k.reference_id, self.map.map_id) for k in self.map.keyframes.values()
         ]
         self._keyframes.update(self.map.keyframes)
         self._landmarks.update(self.map.landmarks.alive_ids().tolist())
         self._edges.update(self.map.covisibility)
-        return renamed
 
     def place(self, landmark: int, point_world: FloatArray) -> None:
         """Set the position (3,) of one landmark."""
@@ -213,6 +247,11 @@ class MapEditor:
         return self._next_landmark
 
     # ---- questions ------------------------------------------------------------------------------------------------------------------
+
+    def carrier(self, landmark: int) -> int:
+        """The keyframe that a landmark moves with: the one that saw it first, or the oldest of those that see it."""
+        first = self.first_keyframe[landmark]
+        return first if first in self.map.keyframes else min(self.observers[landmark])
 
     def observations(self, landmark_ids: IntArray) -> tuple[IntArray, IntArray, IntArray]:
         """All observations of the landmarks: index into `landmark_ids`, keyframe id, keypoint index, (M,) each, in a fixed order."""
@@ -296,12 +335,14 @@ class MapEditor:
             new_keyframes=tuple(self._new),
             keyframes=keyframes,
             landmarks=self.map.landmarks.get(ids) if len(ids) else None,
+            removed_keyframes=tuple(self._removed_keyframes[i] for i in sorted(self._removed_keyframes)),
             removed_landmark_ids=np.array(sorted(self._removed), dtype=np.int64),
             covisibility={i: self.map.covisibility[i] for i in sorted(self._edges)},
             absorbed=absorbed,
             scales=dict(self._scales),
+            revisits=tuple(self._revisits),
         )
-        self._new, self._scales = [], {}
+        self._new, self._scales, self._removed_keyframes, self._revisits = [], {}, {}, []
         for changed in (self._keyframes, self._landmarks, self._removed, self._edges):
             changed.clear()
         return update

@@ -30,6 +30,7 @@ def map_arrays(editor: MapEditor) -> Arrays:
         "keyframes/stamps_ns": np.array([k.stamp_ns for k in keyframes], dtype=np.int64),
         "keyframes/world_from_camera": np.array([k.world_from_camera for k in keyframes]).reshape(-1, 4, 4),
         "keyframes/reference_ids": np.array([k.reference_id for k in keyframes], dtype=np.int64),
+        "keyframes/turns": np.array([k.features.turns for k in keyframes], dtype=np.int64),
         "keyframes/offsets": offsets([len(k.features) for k in keyframes]),
         "keyframes/landmark_ids": np.concatenate([k.landmark_ids for k in keyframes]),
         "landmarks/first_keyframe": np.array([editor.first_keyframe[i] for i in ids], dtype=np.int64),
@@ -49,12 +50,13 @@ def restore_map(arrays: Arrays, map_id: int, camera: CameraModel, extractor: str
     for keyframe_id, other, shared in arrays["covisibility"].tolist():
         edges.setdefault(keyframe_id, []).append((other, shared))
     bounds = arrays["keyframes/offsets"].tolist()
+    turns = arrays.get("keyframes/turns", np.zeros(len(bounds), np.int64))  # files of before images could be turned have none
     keyframes = []
     for row, keyframe_id in enumerate(arrays["keyframes/ids"].tolist()):
         mine = slice(bounds[row], bounds[row + 1])
         stamp_ns = int(arrays["keyframes/stamps_ns"][row])
         parts = {name: arrays[f"keyframes/{name}"][mine] for name in _FEATURES}
-        features = Features(stamp_ns, image_size=camera.image_size, extractor=extractor, **parts)
+        features = Features(stamp_ns, image_size=camera.image_size, extractor=extractor, turns=int(turns[row]), **parts)
         pose, seen = arrays["keyframes/world_from_camera"][row], arrays["keyframes/landmark_ids"][mine]
         keyframes.append(Keyframe(keyframe_id, stamp_ns, pose, features, seen, int(arrays["keyframes/reference_ids"][row]), map_id))
     landmarks = LandmarkArrays(**{name: arrays[f"landmarks/{name}"] for name in COLUMNS})

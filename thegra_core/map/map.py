@@ -107,9 +107,9 @@ class Map:
 
     def apply(self, update: MapUpdate) -> None:
         """Make this replica equal to the map that sent the update. Updates must come in the order of their versions."""
-        for keyframe_id in update.removed_keyframe_ids:
-            self.keyframes.pop(keyframe_id, None)
-            self.covisibility.pop(keyframe_id, None)
+        for removed in update.removed_keyframes:
+            self.keyframes.pop(removed.id, None)
+            self.covisibility.pop(removed.id, None)
         self.keyframes.update((keyframe.id, keyframe) for keyframe in make_keyframes(update.new_keyframes, self.camera))
         for state in update.keyframes:
             keyframe = self.keyframes[state.id]

@@ -2,15 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
 from thegra_core.map.editor import MapEditor
-from thegra_core.optimization.bundle import BundleProblem, bundle_adjust
+from thegra_core.optimization.bundle import BundleProblem, BundleResult
+from thegra_core.optimization.solver import BundleTask
 from thegra_core.optimization.weighting import observation_weights
 
 IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Adjustment:
+    """A part of a map as a bundle adjustment: the task, and what its rows are.
+
+    keyframe_ids (K,), landmark_ids (P,); keypoint `feature` (M,) of keyframe `observer` (M,) makes an observation.
+    """
+
+    keyframe_ids: IntArray
+    landmark_ids: IntArray
+    observer: IntArray
+    feature: IntArray
+    task: BundleTask
+
+    def outlier_observations(self, result: BundleResult) -> list[tuple[int, int, int]]:
+        """Landmark id, keyframe id and keypoint of each observation that the result does not fit."""
+        rows = np.flatnonzero(result.outliers)
+        landmarks = self.landmark_ids[self.task.problem.point_index[rows]]
+        return list(zip(landmarks.tolist(), self.observer[rows].tolist(), self.feature[rows].tolist(), strict=True))
 
 
 def adjust_locally(editor: MapEditor, keyframe_id: int, config: ThegraConfig) -> None:
@@ -23,20 +46,35 @@ def adjust_locally(editor: MapEditor, keyframe_id: int, config: ThegraConfig) ->
     if not outer:  # the whole map is local: its oldest keyframe holds the frame
         outer = [min(local)]
         local = [i for i in local if i not in outer]
-    _adjust(editor, sorted(local), sorted(outer), landmarks, config, config.bundle.iterations, config.bundle.tolerance)
+    _solve(editor, _adjustment(editor, sorted(local), sorted(outer), landmarks, config, config.bundle.iterations, config.bundle.tolerance))
 
 
 def adjust_all(editor: MapEditor, config: ThegraConfig) -> None:
-    """Full bundle adjustment; the first keyframe is held."""
+    """Full bundle adjustment, at once; the first keyframe is held."""
+    _solve(editor, full_adjustment(editor, config))
+
+
+def full_adjustment(editor: MapEditor, config: ThegraConfig) -> Adjustment | None:
+    """The map as it is as a full bundle adjustment, in which the first keyframe is held; None if there is nothing to adjust."""
     ids = sorted(editor.map.keyframes)
-    if len(ids) < 2:
+    return _adjustment(editor, ids[1:], ids[:1], editor.map.landmarks.alive_ids(), config, config.bundle.full_iterations, config.bundle.full_tolerance)
+
+
+def _solve(editor: MapEditor, adjustment: Adjustment | None) -> None:
+    if adjustment is None:
         return
-    _adjust(editor, ids[1:], ids[:1], editor.map.landmarks.alive_ids(), config, config.bundle.full_iterations, config.bundle.full_tolerance)
+    result = adjustment.task.solve()
+    moved = ~adjustment.task.problem.fixed
+    editor.move(adjustment.keyframe_ids[moved], result.world_from_camera[moved], adjustment.landmark_ids, result.points_world)
+    for landmark, keyframe_id, _ in adjustment.outlier_observations(result):
+        editor.forget_observation(landmark, keyframe_id)
 
 
-def _adjust(editor: MapEditor, free: list[int], fixed: list[int], landmarks: IntArray, config: ThegraConfig, iterations: int, tolerance: float) -> None:
+def _adjustment(
+    editor: MapEditor, free: list[int], fixed: list[int], landmarks: IntArray, config: ThegraConfig, iterations: int, tolerance: float
+) -> Adjustment | None:
     if not free or len(landmarks) == 0:
-        return
+        return None
     keyframe_ids = np.array([*free, *fixed], dtype=np.int64)
     row_of = {int(keyframe_id): row for row, keyframe_id in enumerate(keyframe_ids)}
     point, observer, feature = editor.observations(landmarks)
@@ -59,8 +97,4 @@ def _adjust(editor: MapEditor, free: list[int], fixed: list[int], landmarks: Int
         weights=weights,
         focal=editor.map.camera.focal,
     )
-    result = bundle_adjust(problem, config.bundle.huber_px, config.bundle.chi2_px2, iterations, tolerance)
-    moved = ~problem.fixed
-    editor.move(keyframe_ids[moved], result.world_from_camera[moved], landmarks, result.points_world)
-    for index in np.flatnonzero(result.outliers).tolist():
-        editor.forget_observation(int(landmarks[point[index]]), int(observer[index]))
+    return Adjustment(keyframe_ids, landmarks, observer, feature, BundleTask(problem, config.bundle.huber_px, config.bundle.chi2_px2, iterations, tolerance))

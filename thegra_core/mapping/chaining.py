@@ -25,6 +25,11 @@ class MatchGraph:
         self._edges.setdefault(keyframe_id, {})[other_id] = matches
         self._edges.setdefault(other_id, {})[keyframe_id] = reversed_matches(matches)
 
+    def remove(self, keyframe_id: int) -> None:
+        """Forget a keyframe's matches."""
+        for other in self._edges.pop(keyframe_id, {}):
+            del self._edges[other][keyframe_id]
+
     def absorb(self, other: MatchGraph) -> None:
         """Take in the matches between other keyframes."""
         self._edges.update(other._edges)

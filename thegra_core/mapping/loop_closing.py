@@ -12,12 +12,12 @@ from thegra_core.config import ThegraConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.editor import MapEditor
-from thegra_core.mapping.adjustment import adjust_all
+from thegra_core.mapping.adjustment import adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
-from thegra_core.messages import NO_LANDMARK
+from thegra_core.messages import NO_LANDMARK, Revisit
 from thegra_core.optimization.pose_graph import Edge, optimize_pose_graph
 from thegra_core.places.index import PlaceIndex
-from thegra_core.places.verification import Sighting, agree, sight
+from thegra_core.places.verification import Sighting, agree, is_drift, sight
 
 logger = logging.getLogger(__name__)
 ESSENTIAL_NEIGHBOURS = 5
@@ -44,7 +44,7 @@ class LoopCloser:
         """Whether a keyframe of the index, which mapping has finished with, closed a loop."""
         sighting = self._find(editor, keyframe_id)
         before, self._waiting = self._waiting, sighting
-        if before is None or sighting is None or not agree(editor.map, before, sighting, self.config):
+        if before is None or sighting is None or not {before.keyframe_id, *before.matches} <= editor.map.keyframes.keys() or not agree(editor.map, before, sighting, self.config):
             return False
         _close(editor, [before, sighting], graph, self.config)
         self._waiting = None
@@ -59,7 +59,9 @@ class LoopCloser:
             near = [i for i in current.neighbours(candidate, len(current.keyframes)) if i not in connected]
             found = sight(current, keyframe_id, current, [candidate, *near[: self.config.loop.group - 1]], self.matcher, self.config)
             if isinstance(found, Sighting):
-                return found
+                if is_drift(current, found, self.config.loop):
+                    return found
+                found = "the way between cannot have drifted so far"
             logger.debug("keyframe %d looks like %d: %s", keyframe_id, candidate, found)
         return None
 
@@ -78,12 +80,14 @@ def _close(editor: MapEditor, sightings: list[Sighting], graph: MatchGraph, conf
     concerned = {i for sighting in sightings for i in (sighting.keyframe_id, *sighting.matches)}
     for keyframe_id in sorted(concerned | {n for i in concerned for n in current.neighbours(i, ESSENTIAL_NEIGHBOURS)}):
         editor.connect(keyframe_id)
-    adjust_all(editor, config)
     last = sightings[-1]
-    moved = np.linalg.norm(current.keyframes[last.keyframe_id].center - before[last.keyframe_id].rigid[:3, 3]) / depth
+    adjust_both_sides(editor, last, config)
+    moved = float(np.linalg.norm(current.keyframes[last.keyframe_id].center - before[last.keyframe_id].rigid[:3, 3])) / depth
+    keyframe, old_id, scale = current.keyframes[last.keyframe_id], next(iter(last.matches)), last.world_from_camera.scale
+    editor.note(Revisit(keyframe.stamp_ns, current.map_id, keyframe.id, old_id, len(last.keypoints), moved, scale))
     logger.info(
         "loop closed: keyframe %d sees what keyframe %d saw, by %d landmarks; it moves by %.3f of the scene's depth, scale %.3f",
-        last.keyframe_id, next(iter(last.matches)), len(last.keypoints), moved, last.world_from_camera.scale,
+        keyframe.id, old_id, len(last.keypoints), moved, scale,
     )  # fmt: skip
 
 
@@ -105,7 +109,7 @@ def _move(editor: MapEditor, before: dict[int, Similarity], after: dict[int, Sim
     current = editor.map
     ids = current.landmarks.alive_ids()
     points = current.landmarks.points_world[current.landmarks.rows(ids)].copy()
-    carriers = np.array([_carrier(editor, i) for i in ids.tolist()], dtype=np.int64)
+    carriers = np.array([editor.carrier(i) for i in ids.tolist()], dtype=np.int64)
     for carrier in np.unique(carriers).tolist():
         mine = carriers == carrier
         points[mine] = (after[carrier] @ before[carrier].inverse()).apply(points[mine])
@@ -113,9 +117,11 @@ def _move(editor: MapEditor, before: dict[int, Similarity], after: dict[int, Sim
     editor.move(keyframes, np.stack([after[i].rigid for i in keyframes.tolist()]), ids, points)
 
 
-def _carrier(editor: MapEditor, landmark: int) -> int:
-    first = editor.first_keyframe[landmark]
-    return first if first in editor.map.keyframes else min(editor.observers[landmark])
+def adjust_both_sides(editor: MapEditor, sighting: Sighting, config: ThegraConfig) -> None:
+    """Local adjustments where an old place and a new one have met."""
+    for keyframe_id in (next(iter(sighting.matches)), sighting.keyframe_id):
+        adjust_locally(editor, keyframe_id, config)
+        editor.connect(keyframe_id)
 
 
 def fuse_sighting(editor: MapEditor, sighting: Sighting) -> None:

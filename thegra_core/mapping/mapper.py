@@ -17,18 +17,24 @@ from thegra_core.mapping import culling
 from thegra_core.mapping.adjustment import adjust_all, adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
 from thegra_core.mapping.expansion import expand
+from thegra_core.mapping.full_adjustment import FullAdjustments
 from thegra_core.mapping.loop_closing import LoopCloser
 from thegra_core.mapping.merging import MapMerger, merge
 from thegra_core.mapping.persistence import KeptMap, load_map, save_map
 from thegra_core.messages import Absorbed, InitialMap, Keyframe, MapSummary, MapUpdate, Matches
+from thegra_core.optimization.solver import BundleSolver, InlineSolver
 
 logger = logging.getLogger(__name__)
 
 
 class Mapper:
-    """Keyframes in, map updates out (paper Sec. III-C). Not thread-safe: one caller at a time."""
+    """Keyframes in, map updates out (paper Sec. III-C). Not thread-safe: one caller at a time.
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher) -> None:
+    Args:
+        solver: Makes the full adjustments after loops and merges. The default makes them in the calling thread, at a fixed keyframe: a run can be repeated.
+    """
+
+    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher, solver: BundleSolver | None = None) -> None:
         self._camera = camera
         self._config = config
         self._matcher = matcher
@@ -37,6 +43,7 @@ class Mapper:
         self._graphs: dict[int, MatchGraph] = {}
         self._loops: dict[int, LoopCloser] = {}
         self._merger = MapMerger(config, matcher)
+        self._full = FullAdjustments(solver or InlineSolver(), config)
         self.merges = 0
 
     def initialize(self, initial: InitialMap) -> MapUpdate:
@@ -64,19 +71,25 @@ class Mapper:
         return editor.take_update()
 
     def insert(self, keyframe: Keyframe) -> MapUpdate:
-        """Insert a keyframe: observations, culling, expansion with its neighbours, local bundle adjustment."""
+        """Insert a keyframe: observations, culling, expansion with its neighbours, local bundle adjustment; then what it may tie together.
+
+        A full adjustment that is done comes in before the local one, which smooths the seams to what has come since.
+        """
         editor = self._editors[keyframe.map_id]
         editor.add_keyframe(keyframe)
         editor.connect(keyframe.id)
         self._cull(editor, keyframe)
         self._expand(editor, keyframe)
         editor.connect(keyframe.id)
+        self._thin(editor, keyframe.id)
+        self._full.collect(editor)
         adjust_locally(editor, keyframe.id, self._config)
         editor.connect(keyframe.id)
         loops = self._loops[keyframe.map_id]
         loops.index.add(keyframe.id, keyframe.features)
         if self._config.loop.enabled:
-            loops.look(editor, keyframe.id, self._graphs[keyframe.map_id])
+            if loops.look(editor, keyframe.id, self._graphs[keyframe.map_id]):
+                self._full.start(editor)
             merged = self._merge(editor, keyframe.id)
             if merged is not None:
                 return merged
@@ -85,6 +98,7 @@ class Mapper:
     def finish(self, map_id: int) -> MapUpdate:
         """Full bundle adjustment of a map at the end of a run."""
         editor = self._editors[map_id]
+        self._full.cancel(map_id)
         adjust_all(editor, self._config)
         return editor.take_update()
 
@@ -120,8 +134,15 @@ class Mapper:
         logger.info("%s: %d keyframes and %d landmarks", path, len(kept.editor.map.keyframes), len(kept.editor.map.landmarks))
         return kept.editor.take_update()
 
+    def whole(self, map_id: int) -> MapUpdate:
+        """All of a map as an update, for a replica that begins."""
+        editor = self._editors[map_id]
+        editor.touch_all()
+        return editor.take_update()
+
     def drop(self, map_id: int) -> None:
         """Forget a map that tracking has given up."""
+        self._full.cancel(map_id)
         del self._editors[map_id], self._trial[map_id], self._graphs[map_id], self._loops[map_id]
 
     @property
@@ -155,11 +176,12 @@ class Mapper:
         for sighting in tie.sightings:
             for other, matches in sighting.matches.items():
                 graph.add(sighting.keyframe_id, other, matches)
-        for i, keyframe in sorted(editor.map.keyframes.items()):
-            self._loops[tie.old_map_id].index.add(i, keyframe.features)
+        for i, joined in sorted(editor.map.keyframes.items()):
+            self._loops[tie.old_map_id].index.add(i, joined.features)
         self._loops[tie.old_map_id].closed += self._loops[map_id].closed
         self._trial[tie.old_map_id].extend(renamed[i] for i in self._trial[map_id] if i in renamed)
         self.drop(map_id)
+        self._full.start(old)
         self.merges += 1
         return old.take_update(Absorbed(map_id, similarity.rigid, similarity.scale))
 
@@ -170,6 +192,12 @@ class Mapper:
             editor.remove_landmarks(culling.untrackable(editor, concerned, self._config.mapping))
         remove, self._trial[keyframe.map_id] = culling.failed_trial(editor, trial, keyframe.id, self._config.mapping)
         editor.remove_landmarks(remove)
+
+    def _thin(self, editor: MapEditor, keyframe_id: int) -> None:
+        """Let redundant keyframes go; the newest stay, which tracking and the search for loops hold on to."""
+        for removed in culling.remove_redundant(editor, keyframe_id, self._config.mapping):
+            self._graphs[editor.map.map_id].remove(removed)
+            self._loops[editor.map.map_id].index.remove(removed)
 
     def _expand(self, editor: MapEditor, keyframe: Keyframe) -> None:
         """Match the keyframe to its neighbours, the reference first, whose matches tracking already has, and through them to theirs."""

@@ -11,8 +11,8 @@ from thegra_core.features.protocols import Matcher
 from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.editor import MapEditor
 from thegra_core.map.map import Map
-from thegra_core.mapping.adjustment import adjust_all
-from thegra_core.mapping.loop_closing import ESSENTIAL_NEIGHBOURS, fuse_sighting
+from thegra_core.mapping.loop_closing import ESSENTIAL_NEIGHBOURS, adjust_both_sides, fuse_sighting
+from thegra_core.messages import Revisit
 from thegra_core.places.index import NEAR, PlaceIndex
 from thegra_core.places.verification import Sighting, agree, sight
 
@@ -59,13 +59,17 @@ class MapMerger:
 
 
 def merge(old: MapEditor, new: MapEditor, tie: Tie, config: ThegraConfig) -> dict[int, int]:
-    """Make the new map part of the old one, which is adjusted as a whole; returns the new ids of the new map's landmarks."""
-    renamed = old.absorb(new, tie.old_from_new(new.map))
+    """Make the new map part of the old one, which is adjusted where they meet; returns the new ids of the new map's landmarks."""
+    old_from_new = tie.old_from_new(new.map)
+    renamed = old.absorb(new, old_from_new)
     for sighting in tie.sightings:
         fuse_sighting(old, sighting)
     concerned = {i for sighting in tie.sightings for i in (sighting.keyframe_id, *sighting.matches)}
     for keyframe_id in sorted(concerned | {n for i in concerned for n in old.map.neighbours(i, ESSENTIAL_NEIGHBOURS)}):
         old.connect(keyframe_id)
-    adjust_all(old, config)
-    logger.info("map %d is part of map %d: keyframe %d sees the same by %d landmarks", new.map.map_id, old.map.map_id, tie.sightings[-1].keyframe_id, len(tie.sightings[-1].keypoints))
+    adjust_both_sides(old, tie.sightings[-1], config)
+    last, (theirs, ours) = tie.sightings[-1], (new.map.map_id, old.map.map_id)
+    stamp_ns = old.map.keyframes[last.keyframe_id].stamp_ns
+    old.note(Revisit(stamp_ns, ours, last.keyframe_id, next(iter(last.matches)), len(last.keypoints), 0.0, old_from_new.scale, theirs))
+    logger.info("map %d is part of map %d: keyframe %d sees the same by %d landmarks", theirs, ours, last.keyframe_id, len(last.keypoints))
     return renamed

@@ -29,6 +29,7 @@ from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.service import InlineMapping
 from thegra_core.messages import InitialMap, Keyframe, MapUpdate
+from thegra_core.optimization.solver import ProcessSolver
 from thegra_core.process import Usage, keep_freed_memory, own_usage
 
 logger = logging.getLogger(__name__)
@@ -198,7 +199,7 @@ def serve(connection: Connection) -> None:
         try:
             if name == "begin":
                 camera, config, make_matcher = arguments
-                mapping = InlineMapping(Mapper(camera, config, make_matcher(config)))
+                mapping = InlineMapping(Mapper(camera, config, make_matcher(config), ProcessSolver()))
                 continue
             assert mapping is not None
             answer = _do(mapping, name, arguments)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from thegra_core.config import ThegraConfig
-from thegra_core.messages import FrameRecord, Run, TrackingState
+from thegra_core.messages import FrameRecord, Revisit, Run, TrackingState
 from thegra_core.outputs.scoring import Score, path_length, score_trajectory, within
 from thegra_core.outputs.trajectory import NS_PER_S, Trajectory, final_trajectory, live_trajectory
 from thegra_core.process import own_usage
@@ -91,9 +92,30 @@ def run_metrics(
         "relocalizations": run.relocalizations,
         "loops": run.loops,
         "merges": run.merges,
+        "loop_events": [_revisit(r) for r in run.revisits],
+        "loss_events": _losses(run),
         "shutter_closures": [[begin / NS_PER_S, end / NS_PER_S] for begin, end in run.shutter_closures_ns],
     }
     return metrics | (_score_metrics(scores) if scores else {}) | _time_metrics(run, timing) | {"seed": config.seed, "profile": config.profile, "version": VERSION}
+
+
+def _revisit(revisit: Revisit) -> dict[str, Any]:
+    """A loop or a merge: when, which keyframes, by how many landmarks, and what it set right (`moved` in median scene depths)."""
+    facts = asdict(revisit)
+    facts["stamp_s"] = facts.pop("stamp_ns") / NS_PER_S
+    return {"kind": "loop" if revisit.is_loop else "merge", **facts}
+
+
+def _losses(run: Run) -> list[dict[str, Any]]:
+    """Each time that tracking was lost: when, why, and when it went on (None: it did not) in which map."""
+    found: list[dict[str, Any]] = []
+    told = [f.result for f in run.frames if f.result.reason not in run.bad_frames and f.result.state is not TrackingState.HOLD]
+    for before, result in pairwise(told):
+        if result.state is TrackingState.LOST and before.state in (TrackingState.TRACKING, TrackingState.RELOCALIZING):
+            found.append({"lost_s": result.stamp_ns / NS_PER_S, "reason": result.reason, "found_s": None, "map_id": None})
+        elif result.state is TrackingState.TRACKING and found and found[-1]["found_s"] is None:
+            found[-1] |= {"found_s": result.stamp_ns / NS_PER_S, "map_id": result.map_id}
+    return found
 
 
 def percentiles(values: Sequence[float] | np.ndarray[Any, Any], which: Iterable[int]) -> dict[str, float | None]:

@@ -27,6 +27,7 @@ class PlaceIndex:
         self._waiting: dict[int, Features] = {}
         self._vocabulary: FloatArray | None = None
         self._rows: dict[int, int] = {}
+        self._ids: list[int] = []
         self._vectors = np.empty((0, 0), np.float32)
 
     def add(self, keyframe_id: int, features: Features) -> None:
@@ -41,6 +42,17 @@ class PlaceIndex:
             self._waiting.clear()
             return
         self._append(keyframe_id, features)
+
+    def remove(self, keyframe_id: int) -> None:
+        """Forget a keyframe, if it is there."""
+        self._waiting.pop(keyframe_id, None)
+        row = self._rows.pop(keyframe_id, None)
+        if row is None:
+            return
+        last = self._ids.pop()
+        if last != keyframe_id:
+            self._vectors[row] = self._vectors[len(self._ids)]
+            self._ids[row], self._rows[last] = last, row
 
     def query(self, features: Features, most: int) -> list[int]:
         """At most `most` keyframes that look most like an image that is none of them, the most similar first."""
@@ -71,7 +83,7 @@ class PlaceIndex:
         """Words and vectors for a map file; nothing before there are words."""
         if self._vocabulary is None:
             return {}
-        return {"vocabulary": self._vocabulary, "ids": np.array(list(self._rows), dtype=np.int64), "vectors": self._vectors[: len(self._rows)]}
+        return {"vocabulary": self._vocabulary, "ids": np.array(self._ids, dtype=np.int64), "vectors": self._vectors[: len(self._ids)]}
 
     def restore(self, arrays: Arrays, features: Mapping[int, Features]) -> None:
         """Take what `arrays` gave, of the keyframes whose features are given by id."""
@@ -81,11 +93,12 @@ class PlaceIndex:
             return
         self._waiting.clear()
         self._vocabulary, self._vectors = arrays["vocabulary"], arrays["vectors"]
-        self._rows = {keyframe_id: row for row, keyframe_id in enumerate(arrays["ids"].tolist())}
+        self._ids = arrays["ids"].tolist()
+        self._rows = {keyframe_id: row for row, keyframe_id in enumerate(self._ids)}
 
     def _similar(self, vector: FloatArray) -> dict[int, float]:
         """Cosine of every keyframe's vector with a vector."""
-        return dict(zip(self._rows, (self._vectors[: len(self._rows)] @ vector).tolist(), strict=True))
+        return dict(zip(self._ids, (self._vectors[: len(self._ids)] @ vector).tolist(), strict=True))
 
     def _above_bar(self, similar: dict[int, float], near: list[float]) -> list[int]:
         if not near:
@@ -96,7 +109,7 @@ class PlaceIndex:
     def _append(self, keyframe_id: int, features: Features) -> None:
         assert self._vocabulary is not None
         vector = describe(features, self._vocabulary)
-        count = len(self._rows)
+        count = len(self._ids)
         if count == len(self._vectors):
             grown = np.zeros((max(64, 2 * count), len(vector)), np.float32)
             if count:
@@ -104,6 +117,7 @@ class PlaceIndex:
             self._vectors = grown
         self._vectors[count] = vector
         self._rows[keyframe_id] = count
+        self._ids.append(keyframe_id)
 
 
 def _ranked(similar: dict[int, float]) -> list[int]:

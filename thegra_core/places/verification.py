@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thegra_core.config import ThegraConfig
+from thegra_core.config import LoopConfig, ThegraConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry import poses
 from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.inheritance import inherited_landmarks
 from thegra_core.map.map import Map, MapKeyframe
+from thegra_core.map.projection import visible_landmarks
 from thegra_core.messages import Matches
 from thegra_core.optimization.pose import RANSAC_THRESHOLD_PX, estimate_pose, refine_pose
 from thegra_core.optimization.weighting import observation_weights
@@ -61,10 +62,30 @@ def sight(new: Map, keyframe_id: int, old: Map, group: list[int], matcher: Match
     keypoints, landmarks, points = keypoints[estimate.inliers], landmarks[estimate.inliers], points[estimate.inliers]
     if len(keypoints) < settings.min_inliers:
         return f"{len(keypoints)} landmarks agree with one pose"
+    visible = _visible(old, list(matched), estimate.camera_from_world, config)
+    if len(keypoints) < settings.min_visible_share * visible:
+        return f"{len(keypoints)} landmarks agree with one pose, {visible} should be seen from there"
     scale = _scale(new, keyframe, keypoints, poses.apply(estimate.camera_from_world, points)[:, 2], config)
     if isinstance(scale, str):
         return scale
     return Sighting(keyframe_id, Similarity(poses.inverse(estimate.camera_from_world), scale), keypoints, landmarks, matched)
+
+
+def is_drift(current: Map, sighting: Sighting, config: LoopConfig) -> bool:
+    """Whether a sighting of the same map moves its keyframe by no more than what may have drifted on the way since the old place.
+
+    Buildings repeat themselves: what looks alike at another place asks for a correction as large as the way between the two. A drift of scale by itself
+    moves what lies behind the camera, by half the way for each factor of e.
+    """
+    estimated = Similarity(current.keyframes[sighting.keyframe_id].world_from_camera)
+    correction = sighting.world_from_camera @ estimated.inverse()
+    old = next(iter(sighting.matches))
+    first, last = sorted((old, sighting.keyframe_id))
+    centers = np.array([current.keyframes[i].center for i in sorted(current.keyframes) if first <= i <= last])
+    way = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+    moved = float(np.linalg.norm(sighting.world_from_camera.rigid[:3, 3] - estimated.rigid[:3, 3]))
+    turned = np.degrees(poses.rotation_angle(correction.rigid[:3, :3]))
+    return bool(turned <= config.max_drift_deg and moved <= (config.max_drift_ratio + 0.5 * abs(np.log(correction.scale))) * way)
 
 
 def agree(new: Map, one: Sighting, other: Sighting, config: ThegraConfig) -> bool:
@@ -79,6 +100,13 @@ def agree(new: Map, one: Sighting, other: Sighting, config: ThegraConfig) -> boo
         and float(np.linalg.norm(difference.rigid[:3, 3])) <= settings.max_translation_ratio * depth
         and abs(np.log(difference.scale)) <= settings.max_scale_spread
     )
+
+
+def _visible(old: Map, group: list[int], camera_from_world: NDArray[np.float64], config: ThegraConfig) -> int:
+    """How many of the landmarks that keyframes of the old place see a camera should see."""
+    ids = np.unique(np.concatenate([old.keyframes[i].landmark_ids for i in group]))
+    alive = ids[old.landmarks.rows(ids) >= 0]
+    return len(visible_landmarks(old.landmarks, alive, camera_from_world, old.camera, config.tracking).ids)
 
 
 def _scale(new: Map, keyframe: MapKeyframe, keypoints: IntArray, old_depth: NDArray[np.float64], config: ThegraConfig) -> float | str:

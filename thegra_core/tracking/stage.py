@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -47,6 +48,8 @@ class TrackingOutput:
 
     While a new map is on probation nothing is claimed: `result` has no pose, and `provisional` is the result that holds if the map stands.
     `dropped_map_id` names a map that did not stand. landmark_ids (N,) per keypoint and the matches used are for viewers; None where there are none.
+    found_turned: the frame's features of another orientation, by which it was found; landmark_ids and matches are theirs, and the next frames had better be
+    turned alike.
     """
 
     result: TrackingResult
@@ -56,6 +59,7 @@ class TrackingOutput:
     matches: Matches | None = None
     provisional: TrackingResult | None = None
     dropped_map_id: int | None = None
+    found_turned: Features | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +109,8 @@ class _Place:
 
     def take(self, update: MapUpdate) -> None:
         self.map.apply(update)
+        for removed in update.removed_keyframes:
+            self.places.remove(removed.id)
         for message in update.new_keyframes:
             self.pending.pop(message.id, None)
         for message in update.new_keyframes:
@@ -162,8 +168,8 @@ class TrackingStage:
     def map_id(self) -> int:
         return self._place.map.map_id if self._place is not None else -1
 
-    def process(self, features: Features, matches: Matches | None) -> TrackingOutput:
-        """Track one frame; `matches` are to `reference_features` (None: not matched yet)."""
+    def process(self, features: Features, matches: Matches | None, turned: Iterable[Features] = ()) -> TrackingOutput:
+        """Track one frame; `matches` are to `reference_features` (None: not matched yet). `turned` gives its features of other orientations, taken as needed."""
         place = self._place
         if place is None:
             return self._start(features, matches)
@@ -173,7 +179,7 @@ class TrackingStage:
             matches = self._matcher.match(features, place.reference)
         found = localize(place.map, features, place.reference_id, {place.reference_id: matches}, place.predict(features.stamp_ns), self._config)
         if isinstance(found, str):
-            return self._recover(place, features, matches, found)
+            return self._recover(place, features, matches, found, turned)
         return self._accept(place, features, found, matches)
 
     def process_followed(self, features: Features, matches: Matches | None) -> TrackingOutput | Wanted:
@@ -210,13 +216,16 @@ class TrackingStage:
         )  # fmt: skip
         return TrackingOutput(result)
 
-    def resume(self, update: MapUpdate) -> None:
-        """Take up a map that was kept, before the first frame: the frames to come are sought in all of it."""
+    def resume(self, update: MapUpdate, next_map_id: int = 0, next_keyframe_id: int = 0) -> None:
+        """Take up a map that was kept, before the first frame: the frames to come are sought in all of it.
+
+        New maps and keyframes get ids that the map does not hold, from `next_map_id` and `next_keyframe_id` on: mapping may have other maps beside it.
+        """
         newest = max(m.id for m in update.new_keyframes)
         place = _Place(Map(update.map_id, self._camera), self._place_index(), newest, newest, probation=0, lost_frames=1, resumed=True)
         place.search_frames = self._config.relocalization.search_frames
         self._place = place
-        self._next_map_id, self._next_keyframe_id = update.map_id + 1, newest + 1
+        self._next_map_id, self._next_keyframe_id = max(update.map_id + 1, next_map_id), max(newest + 1, next_keyframe_id)
         self.apply(update)
 
     def reopen(self) -> None:
@@ -394,29 +403,38 @@ class TrackingStage:
         depth = place.map.median_depth(place.reference_id, found.world_from_camera)
         return bool(needs_keyframe(place.last_keyframe_pose, found.world_from_camera, depth, tracked_ratio, self._config.keyframe))
 
-    def _recover(self, place: _Place, features: Features, matches: Matches, reason: str) -> TrackingOutput:
+    def _recover(self, place: _Place, features: Features, matches: Matches, reason: str, turned: Iterable[Features]) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
         if place.probation:
             dropped = self._drop()
             logger.info("map %s did not stand its probation: %s", dropped, reason)
             output = self._start(features, None) if self._place is None else self._stay_lost(self._place, features, reason)
             return replace(output, dropped_map_id=dropped)
-        settings = self._config.relocalization
-        if place.lost_frames == 0:
-            candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
-        else:
-            candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
-        least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
-        found = relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
+        found = self._seek(place, features, matches)
         if found is not None:
             place.reference_id = found[1]
             return self._accept(place, features, found[0], found[2])
+        for other in turned if place.lost_frames < self._config.relocalization.new_map_after_frames else ():
+            found = self._seek(place, other, self._matcher.match(other, place.reference))
+            if found is not None:
+                place.reference_id = found[1]
+                return replace(self._accept(place, other, found[0], found[2]), found_turned=other)
         if place.search_frames:
             place.search_frames -= 1
             self._unplaced.append(features)
             result = TrackingResult(features.stamp_ns, TrackingState.RELOCALIZING, keypoints=len(features), map_id=place.map.map_id, reason=reason)
             return TrackingOutput(result)
         return self._stay_lost(place, features, reason)
+
+    def _seek(self, place: _Place, features: Features, matches: Matches) -> tuple[Localization, int, Matches] | None:
+        """Match a frame to the last keyframes or, once it is lost, to those that look most alike; `matches` are to the reference."""
+        settings = self._config.relocalization
+        if place.lost_frames == 0:
+            candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
+        else:
+            candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
+        least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
+        return relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:

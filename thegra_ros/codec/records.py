@@ -6,8 +6,9 @@ how many it is, and `Assembler` puts them together. Poses are float64 columns of
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,19 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from thegra_core.messages import Absorbed, Features, InitialMap, Keyframe, KeyframeState, LandmarkArrays, MapUpdate, Matches, VisibilityCounts
+from thegra_core.messages import (
+    Absorbed,
+    Features,
+    InitialMap,
+    Keyframe,
+    KeyframeState,
+    LandmarkArrays,
+    MapUpdate,
+    Matches,
+    RemovedKeyframe,
+    Revisit,
+    VisibilityCounts,
+)
 from thegra_ros.codec.clouds import Table, cloud_message, cloud_table
 
 LANDMARK_COLUMNS = ("ids", "points_world", "normals", "depth_min", "depth_max", "descriptors", "scores")
@@ -46,6 +59,11 @@ class Assembler:
             return None
         parts, self._parts = self._parts, []
         return table.facts["record"], parts
+
+
+def word(facts: Mapping[str, str]) -> Table:
+    """A table that holds facts only."""
+    return Table({"id": np.empty(0, np.int64)}, facts)
 
 
 # ---- features and matches -----------------------------------------------------------------------------------------------------------
@@ -128,14 +146,14 @@ def tables_initial_map(tables: list[Table]) -> InitialMap:
 
 def update_tables(update: MapUpdate) -> list[Table]:
     """Poses and landmark ids of changed keyframes, landmarks, what was removed, who sees the same, and new keyframes."""
-    facts = {"update": str(update.version), "map": str(update.map_id)}
+    facts = {"update": str(update.version), "map": str(update.map_id), "revisits": json.dumps([asdict(revisit) for revisit in update.revisits])}
     if update.absorbed is not None:
         facts["absorbed"] = str(update.absorbed.map_id)
         facts["old_from_absorbed"] = " ".join(repr(x) for x in [*update.absorbed.rigid.ravel().tolist(), update.absorbed.scale])
     tables = [Table(_pose_table({k.id: k.world_from_camera for k in update.keyframes}).columns, facts), *_ragged("keyframe_landmarks", {k.id: k.landmark_ids for k in update.keyframes})]
     if update.landmarks is not None:
         tables.append(Table({name: getattr(update.landmarks, name) for name in LANDMARK_COLUMNS}, {"landmarks": "1"}))
-    tables.append(Table({"id": np.array(update.removed_keyframe_ids, dtype=np.int64)}, {"removed_keyframes": "1"}))
+    tables.append(_removed_table(update.removed_keyframes))
     tables.append(Table({"id": update.removed_landmark_ids}, {"removed_landmarks": "1"}))
     tables += _ragged("covisibility", {i: np.array(pairs, dtype=np.int64).reshape(-1, 2) for i, pairs in update.covisibility.items()}, 2)
     tables.append(Table({"id": np.array(list(update.scales), dtype=np.int64), "scale": np.array(list(update.scales.values()), dtype=np.float64)}, {"scales": "1"}))
@@ -154,13 +172,25 @@ def tables_update(tables: list[Table]) -> MapUpdate:
         map_id=int(facts["map"]),
         new_keyframes=tuple(tables_keyframes(tables[_first_keyframe(tables) :])),
         keyframes=tuple(KeyframeState(i, pose, ids[i]) for i, pose in _poses(head).items()),
-        removed_keyframe_ids=tuple(_ids(named["removed_keyframes"], "id").tolist()),
+        removed_keyframes=_removed(named["removed_keyframes"]),
         landmarks=LandmarkArrays(**{n: _ids(landmarks, n) if n == "ids" else landmarks.columns[n] for n in LANDMARK_COLUMNS}) if landmarks is not None else None,
         removed_landmark_ids=_ids(named["removed_landmarks"], "id"),
         covisibility={i: tuple((int(a), int(b)) for a, b in pairs.tolist()) for i, pairs in _split(named["covisibility"]).items()},
         absorbed=_absorbed(facts),
         scales=dict(zip(_ids(scales, "id").tolist(), scales.columns["scale"].tolist(), strict=True)),
+        revisits=tuple(Revisit(**revisit) for revisit in json.loads(facts["revisits"])),
     )
+
+
+def _removed_table(removed: Sequence[RemovedKeyframe]) -> Table:
+    columns = {name: np.array([getattr(r, name) for r in removed], dtype=np.int64) for name in ("id", "heir_id")}
+    poses = np.array([r.heir_from_removed.ravel() for r in removed], dtype=np.float64).reshape(-1, 16)
+    return Table({**columns, "pose": poses}, {"removed_keyframes": json.dumps([r.stamp_ns for r in removed])})
+
+
+def _removed(table: Table) -> tuple[RemovedKeyframe, ...]:
+    ids, heirs, stamps = _ids(table, "id").tolist(), _ids(table, "heir_id").tolist(), json.loads(table.facts["removed_keyframes"])
+    return tuple(RemovedKeyframe(*each) for each in zip(ids, stamps, heirs, table.columns["pose"].reshape(-1, 4, 4), strict=True))
 
 
 def _absorbed(facts: Mapping[str, str]) -> Absorbed | None:

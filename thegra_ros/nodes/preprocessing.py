@@ -6,6 +6,7 @@ import sys
 
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image
+from std_srvs.srv import SetBool
 
 from thegra_core.messages import Frame, Shutter
 from thegra_core.preprocessing.chain import Chain
@@ -25,6 +26,7 @@ class PreprocessingNode(StageNode):
     def __init__(self) -> None:
         super().__init__("preprocessing")
         self._input: ImageInput | None = None
+        self.offer(SetBool, "~/pause", self._on_pause)
 
     def prepare(self) -> None:
         self._images = self.publisher(Image, "image_preprocessed", STREAM)
@@ -57,6 +59,11 @@ class PreprocessingNode(StageNode):
 
     def begin_anew(self, why: str) -> None:
         self._fresh()
+
+    def _on_pause(self, request: SetBool.Request) -> str:
+        self.health.paused = bool(request.data)
+        self.reporter.report()
+        return "paused: images are ignored" if request.data else "images are worked on"
 
     def _restart(self, why: str) -> None:
         """In the order of the images: what waits is of the old run."""

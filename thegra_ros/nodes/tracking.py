@@ -1,6 +1,7 @@
 """Features and matches in; poses out, keyframes to mapping, and the map's updates back.
 
-After a keyframe tracking waits for mapping's update: the same steps as in one thread, whatever the network does.
+After a keyframe tracking waits for mapping's update: the same steps as in one thread, whatever the network does. When it begins it asks mapping for the map,
+so that it goes on where it was when its process was started again.
 """
 
 from __future__ import annotations
@@ -8,15 +9,16 @@ from __future__ import annotations
 import queue
 import sys
 from collections.abc import Mapping
+from enum import Enum
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
+from thegra_core.errors import InputError
 from thegra_core.features.registry import make_matcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Shutter, TrackingResult, TrackingState
@@ -25,27 +27,35 @@ from thegra_ros.camera_input import CameraInput
 from thegra_ros.camera_place import CameraPlace
 from thegra_ros.codec.clouds import Table, cloud_table
 from thegra_ros.codec.poses import odometry
-from thegra_ros.codec.records import Assembler, initial_map_tables, keyframe_tables, record_clouds, table_features, table_matches, tables_update
+from thegra_ros.codec.records import Assembler, initial_map_tables, keyframe_tables, record_clouds, table_features, table_matches, tables_update, word
 from thegra_ros.codec.shutter import FrameNotice, read_notice
 from thegra_ros.codec.stamps import header, stamp_ns
 from thegra_ros.joiner import FrameJoiner
 from thegra_ros.lifecycle import run_node
 from thegra_ros.outputs import PoseOutputs
 from thegra_ros.qos import LATCHED, LOSSLESS
-from thegra_ros.stage_node import EVERYTHING, StageNode
+from thegra_ros.stage_node import StageNode
 from thegra_ros.transforms import stamped_pose
 
 PATIENCE_S = 5.0
 """After so long a wait for mapping it is said that it does not answer."""
 
 
+class Beginning(Enum):
+    """How tracking begins, as mapping is told."""
+
+    RESUME = "resume"  # in the map that mapping has
+    FRESH = "fresh"  # in that of its file, else in an empty one
+    RESET = "reset"  # in an empty one
+
+
 class TrackingNode(StageNode):
     """The third stage."""
 
-    queue_size = EVERYTHING
-
     def __init__(self) -> None:
         super().__init__("tracking")
+        self.offer(Trigger, "~/reset", self._on_reset)
+        self.offer(SetBool, "~/localization_only", self._on_localization_only)
 
     def prepare(self) -> None:
         self._place = CameraPlace(self, self.own)
@@ -54,15 +64,16 @@ class TrackingNode(StageNode):
         self._keyframe_poses = self.publisher(Odometry, "keyframe_pose", LOSSLESS)
         self._references = self.publisher(Header, "reference", LATCHED)
         self._stage: TrackingStage | None = None
-        self._epoch, self._reference_ns, self._fresh = -1, 0, True
+        self._localizing = self.own.localization_only
+        self._beginning: Beginning | None = Beginning.RESUME
+        self._epoch, self._reference_ns, self._question = -1, 0, 0
         self._assembler, self._updates = Assembler(), queue.SimpleQueue[tuple[str, list[Table]]]()
-        self._camera = CameraInput(self, self.own.camera_file, self.health, self._want_anew)
+        self._camera = CameraInput(self, self.own.camera_file, self.health, lambda why: self._want(Beginning.FRESH, why))
         self._joiner = FrameJoiner("notice", lambda parts: {"features", "matches"} <= set(parts) or _closed(parts), _closed)
         self.listen(DiagnosticArray, "shutter", LOSSLESS, lambda m: self._join("notice", stamp_ns(m), read_notice(m)))
         self.listen(PointCloud2, "features", LOSSLESS, lambda m: self._join("features", stamp_ns(m), table_features(cloud_table(m))))
         self.listen(PointCloud2, "matches", LOSSLESS, lambda m: self._join("matches", stamp_ns(m), table_matches(cloud_table(m))))
         self.listen(PointCloud2, "map_update", LOSSLESS, self._on_update)
-        self.serve(Trigger, "~/reset", self._on_reset)
 
     def load(self) -> None:
         self._matcher = make_matcher(self.config.matcher, self.config.extractor)
@@ -74,76 +85,99 @@ class TrackingNode(StageNode):
             self.health.bad["image without a camera"] += 1
             return
         self._place.see(notice.frame_id)
-        if self._stage is None or self._fresh or notice.epoch != self._epoch:
-            self._begin_stage(camera, notice.epoch)
-        output = self._track(item, notice, camera)
-        self._tell_mapping(output, notice)
-        self._tell_frontend()
-        self._poses.publish(output.result, self._place.frames)
-        if self.health.result_came(output.result):
-            self.reporter.report()
+        if notice.epoch > self._epoch >= 0 and not self._localizing:  # a lower one: preprocessing was started again
+            self._want(Beginning.FRESH, "the stream begins anew")
+        self._epoch = notice.epoch
+        stage = self._begun(camera, notice.shutter.stamp_ns)
+        if stage is None:
+            return
+        stage.localization_only = self._localizing
+        output = _track(stage, item, camera)
+        self._poses.publish(output.result, self._place.frames)  # mapping changes nothing of it: it need not wait
+        self._tell_mapping(stage, output, notice)
+        self._tell_frontend(stage)
+        self._told(output.result)
 
     def begin_anew(self, why: str) -> None:
-        self._fresh = True
+        self._beginning = Beginning.FRESH
 
     def facts(self) -> dict[str, object]:
         stage = self._stage
-        return {"state": self.health.state.value, "lost parts": self._joiner.lost + self._assembler.broken, "map": stage.map_id if stage is not None else -1}
+        return {
+            "state": self.health.state.value, "lost parts": self._joiner.lost + self._assembler.broken, "map": stage.map_id if stage is not None else -1,
+            "map grows": "no" if self._localizing else "yes",
+        }  # fmt: skip
 
     # ---- the working thread ---------------------------------------------------------------------------------------------------------
 
-    def _begin_stage(self, camera: CameraModel, epoch: int) -> None:
-        if self._stage is not None:
-            self.get_logger().info("a new map begins")
-        self._stage, self._epoch, self._fresh = TrackingStage(camera, self.config, self._matcher), epoch, False
+    def _begun(self, camera: CameraModel, stamp: int) -> TrackingStage | None:
+        """The stage to go on with, begun if that is due; None while mapping cannot tell in what."""
+        beginning = self._beginning
+        if beginning is None:
+            return self._stage
+        self._beginning, self._stage = None, None
         self._poses.forget()
-        self._send("reset", [_word({})], 0)
-        while not self._updates.empty():
-            self._updates.get()
+        self._question += 1
+        question = {"question": str(self._question), "beginning": beginning.value}
+        answer = self._ask_mapping("begin", [word(question)], stamp, ("resume", "empty"), question["question"])
+        if answer is None:
+            self._beginning = self._beginning or beginning
+            return None
+        kind, tables = answer
+        if kind == "empty" and self._localizing:
+            self._beginning = Beginning.RESUME
+            self._told(TrackingResult(stamp, TrackingState.LOST, reason="only localisation is on, and mapping has no map: give it a map_file, or call ~/localization_only with false"))
+            return None
+        self._stage = TrackingStage(camera, self.config, self._matcher)
+        if kind == "resume":
+            taken = tables[0].facts
+            self._stage.resume(tables_update(tables[1:]), int(taken["next_map"]), int(taken["next_keyframe"]))
+            self.get_logger().info("the camera is sought in the map that mapping has")
+        else:
+            self.get_logger().info("a new map begins")
+        return self._stage
 
-    def _track(self, item: Mapping[str, Any], notice: FrameNotice, camera: CameraModel) -> TrackingOutput:
-        assert self._stage is not None
-        state = notice.shutter
-        if state.shutter is Shutter.CLOSED:
-            return self._stage.hold(state.stamp_ns, state.reason)
-        if item["features"].image_size != camera.image_size:
-            return TrackingOutput(TrackingResult(state.stamp_ns, TrackingState.LOST, reason="image size differs from the camera's"))
-        if state.shutter is Shutter.JUST_OPENED:
-            self._stage.reopen()
-        matches = item["matches"] if item["matches"].reference_stamp_ns else None
-        return self._stage.process(item["features"], matches)
-
-    def _tell_mapping(self, output: TrackingOutput, notice: FrameNotice) -> None:
+    def _tell_mapping(self, stage: TrackingStage, output: TrackingOutput, notice: FrameNotice) -> None:
         stamp = output.result.stamp_ns
         if output.dropped_map_id is not None:
-            self._send("drop", [_word({"map": str(output.dropped_map_id)})], stamp)
+            self._send("drop", [word({"map": str(output.dropped_map_id)})], stamp)
         if output.initial_map is not None:
-            self._send("initial_map", initial_map_tables(output.initial_map), stamp)
-            self._wait_for_update()
+            kind, tables = "initial_map", initial_map_tables(output.initial_map)
         elif output.keyframe is not None:
             pose = stamped_pose(stamp, output.keyframe.world_from_camera, output.result.covariance, output.result.twist, self._place.frames)
             self._keyframe_poses.publish(odometry(header(stamp, self._place.frames.map), self._place.frames.child, pose))
-            self._send("keyframe", keyframe_tables(output.keyframe), stamp)
-            self._wait_for_update()
+            kind, tables = "keyframe", keyframe_tables(output.keyframe)
+        else:
+            return
+        answer = self._ask_mapping(kind, tables, stamp, ("update",))
+        if answer is not None:
+            stage.apply(tables_update(answer[1]))
 
-    def _wait_for_update(self) -> None:
-        while not self.stopping.is_set() and not self._fresh:
+    def _ask_mapping(self, kind: str, tables: list[Table], stamp: int, expected: tuple[str, ...], question: str = "") -> tuple[str, list[Table]] | None:
+        """Send a record and wait for what mapping answers; None when it wants tracking to begin, or the node ends."""
+        while not self._updates.empty():  # answers that nobody waits for any more
+            self._updates.get()
+        self._send(kind, tables, stamp)
+        while not self.stopping.is_set() and self._beginning is None:
             try:
-                kind, tables = self._updates.get(timeout=PATIENCE_S)
+                answer = self._updates.get(timeout=PATIENCE_S)
             except queue.Empty:
                 self.get_logger().warning("waiting for the node mapping, which does not answer")
+                self._send(*(("begin", tables, stamp) if kind == "begin" else ("known?", [word({})], stamp)))
                 continue
-            if kind == "unknown":
-                self._want_anew("mapping does not know the map: it was started again")
-            elif self._stage is not None:
-                self._stage.apply(tables_update(tables))
-            return
+            if answer[0] in expected and answer[1][0].facts.get("question", "") == question:
+                return answer
+        return None
 
-    def _tell_frontend(self) -> None:
-        reference = self._stage.reference_features if self._stage is not None else None
+    def _tell_frontend(self, stage: TrackingStage) -> None:
+        reference = stage.reference_features
         if reference is not None and reference.stamp_ns != self._reference_ns:
             self._reference_ns = reference.stamp_ns
             self._references.publish(header(reference.stamp_ns, self._place.frames.camera))
+
+    def _told(self, result: TrackingResult) -> None:
+        if self.health.result_came(result):
+            self.reporter.report()
 
     def _send(self, kind: str, tables: list[Table], stamp: int) -> None:
         for cloud in record_clouds(header(stamp, self._place.frames.camera), kind, tables):
@@ -161,26 +195,44 @@ class TrackingNode(StageNode):
 
     def _on_update(self, cloud: PointCloud2) -> None:
         record = self._assembler.add(cloud)
-        if record is not None:
-            self._updates.put(record)
+        if record is None:
+            return
+        if record[0] == "unknown":
+            self._want(Beginning.RESUME, "mapping was started again, or has another map")
+        self._updates.put(record)  # also wakes the thread
 
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._want_anew("reset was called")
-        response.success, response.message = True, "a new map begins with the next image"
-        return response
+    def _on_reset(self, _: Trigger.Request) -> str:
+        if self._localizing:
+            raise InputError("only localisation is on, and after a reset there would be no map: call ~/localization_only with false first")
+        self._want(Beginning.RESET, "reset was called")
+        return "a new map begins with the next image"
 
-    def _want_anew(self, why: str) -> None:
-        self._fresh = True
+    def _on_localization_only(self, request: SetBool.Request) -> str:
+        if request.data and (self._stage is None or self._stage.map_id < 0):
+            raise InputError("there is no map yet in which the camera could be found: wait for one, or call ~/load_map of mapping")
+        self._localizing = bool(request.data)
+        return "the map stays as it is" if request.data else "the map grows"
+
+    def _want(self, beginning: Beginning, why: str) -> None:
+        self._beginning = beginning
         self.health.state = TrackingState.INITIALIZING
-        self.get_logger().info(f"what is known is forgotten: {why}")
+        self.get_logger().info(f"tracking begins again: {why}")
+
+
+def _track(stage: TrackingStage, item: Mapping[str, Any], camera: CameraModel) -> TrackingOutput:
+    state = item["notice"].shutter
+    if state.shutter is Shutter.CLOSED:
+        return stage.hold(state.stamp_ns, state.reason)
+    if item["features"].image_size != camera.image_size:
+        return TrackingOutput(TrackingResult(state.stamp_ns, TrackingState.LOST, reason="image size differs from the camera's"))
+    if state.shutter is Shutter.JUST_OPENED:
+        stage.reopen()
+    matches = item["matches"] if item["matches"].reference_stamp_ns else None
+    return stage.process(item["features"], matches)
 
 
 def _closed(parts: Mapping[str, Any]) -> bool:
     return "notice" in parts and parts["notice"].shutter.shutter is Shutter.CLOSED
-
-
-def _word(facts: dict[str, str]) -> Table:
-    return Table({"id": np.empty(0, np.int64)}, facts)
 
 
 def main() -> None:

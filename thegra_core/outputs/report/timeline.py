@@ -9,7 +9,7 @@ from itertools import groupby
 
 import numpy as np
 
-from thegra_core.messages import FrameRecord, Run, TrackingState
+from thegra_core.messages import FrameRecord, Revisit, Run, TrackingState
 from thegra_core.outputs.metrics import is_bad
 from thegra_core.outputs.trajectory import NS_PER_S
 
@@ -89,7 +89,7 @@ def stretches(run: Run) -> list[Stretch]:
 
 
 def events(run: Run) -> list[Event]:
-    """Changes of state, in words, at most a page of them."""
+    """Changes of state, loops and merges, in words, at most a page of them."""
     if not run.frames:
         return []
     times = dict(zip((f.index for f in run.frames), times_s(run.frames).tolist(), strict=True))
@@ -101,10 +101,20 @@ def events(run: Run) -> list[Event]:
         told.append(Event(times[members[0].index], members[0].index, _describe(before, state, members, known)))
         before = state
         known |= {f.result.map_id for f in members if state is TrackingState.TRACKING}
+    by_stamp = {f.stamp_ns: f.index for f in run.frames}
+    told += [Event(times[by_stamp[r.stamp_ns]], by_stamp[r.stamp_ns], _revisit(r)) for r in run.revisits if r.stamp_ns in by_stamp]
+    told.sort(key=lambda event: event.time_s)
     if len(told) > _MAX_EVENTS:
         rest = len(told) - _MAX_EVENTS
-        told = [*told[:_MAX_EVENTS], Event(told[_MAX_EVENTS].time_s, told[_MAX_EVENTS].frame, f"... and {rest} more changes of state")]
+        told = [*told[:_MAX_EVENTS], Event(told[_MAX_EVENTS].time_s, told[_MAX_EVENTS].frame, f"... and {rest} more")]
     return told
+
+
+def _revisit(revisit: Revisit) -> str:
+    seen = f"keyframe {revisit.keyframe_id} sees by {revisit.landmarks} landmarks what keyframe {revisit.old_keyframe_id} saw"
+    if revisit.is_loop:
+        return f"loop closed in map {revisit.map_id}: {seen}; it moves by {revisit.moved:.3f} of the scene's depth, scale {revisit.scale:.3f}"
+    return f"map {revisit.absorbed_map_id} becomes part of map {revisit.map_id}: {seen}; scale {revisit.scale:.3f}"
 
 
 def _describe(before: TrackingState | None, state: TrackingState, frames: list[FrameRecord], known_maps: set[int]) -> str:

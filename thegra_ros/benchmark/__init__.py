@@ -1,0 +1,1 @@
+"""What ROS costs, and whether a node can run for long."""
