@@ -35,7 +35,7 @@ from thegra_core.process import Usage, keep_freed_memory, own_usage
 logger = logging.getLogger(__name__)
 LAST_WORDS_S = 5.0
 """How long an ending process may take before it is killed."""
-NICENESS = 10
+NICENESS = 4
 """Tracking goes first where cores are few."""
 _END = None
 _LAUNCH = f"import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); from {__name__} import main; main()"
