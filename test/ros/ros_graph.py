@@ -40,6 +40,9 @@ FAST = {"profile": "fast", "extractor.name": "orb", "preprocessing.filters": "he
 OFFLINE = {name: "[{filter: he_clip}]" if name == "preprocessing.filters" else value for name, value in FAST.items() if name != "profile"}
 """The same as overrides of a configuration."""
 EVERY_IMAGE = {f"qos_overrides.{NAMESPACE}/image_raw.subscription.reliability": "reliable", f"qos_overrides.{NAMESPACE}/image_raw.subscription.depth": "1000", "queue_size": "1000"}
+"""With these a node receives and works on all that a test sends."""
+IN_STEP = {"engine": "thread"}
+"""Mapping in step with tracking: the poses are those of the offline run, however fast the images come."""
 
 
 class NodeProcess:
@@ -98,7 +101,7 @@ class Graph:
 
     def start(self, module: str = "thegra_ros.nodes.slam", parameters: dict[str, str] | None = None, extra: Sequence[str] = ()) -> NodeProcess:
         log = self._folder / f"{module.rsplit('.', 1)[-1]}_{len(self._processes)}.log"
-        process = NodeProcess(module, {**FAST, **EVERY_IMAGE, **(parameters or {})}, self.environment, log, extra)
+        process = NodeProcess(module, {**FAST, **EVERY_IMAGE, **IN_STEP, **(parameters or {})}, self.environment, log, extra)
         self._processes.append(process)
         return process
 
