@@ -15,7 +15,7 @@ from thegra_core.errors import MappingError, WeightsError
 from thegra_core.features.protocols import Wanted
 from thegra_core.features.tracks import TrackMatcher
 from thegra_core.mapping.process import MappingProcess
-from thegra_core.messages import Features, Run, TrackingResult, TrackingState
+from thegra_core.messages import Features, MapUpdate, Run, TrackingResult, TrackingState
 from thegra_core.slam import Slam
 
 FOLLOWING = CONFIG.model_copy(update={"flow": FlowConfig(enabled=True)})
@@ -185,6 +185,31 @@ def test_a_process_of_its_own_maps_as_well(beside: Slam) -> None:
     assert (run.losses, len(run.maps)) == (0, 1) and len(run.maps[0].keyframe_poses) > 5
     used = beside.usage()
     assert used.cpu_s > 0 and used.peak_rss_mb > 50
+
+
+def test_new_landmarks_come_before_they_are_adjusted(beside: Slam) -> None:
+    """A keyframe is answered twice: by what is new, and by where everything is after the adjustment."""
+    updates, taken = beside._mapping.updates, []
+
+    def recorded() -> list[MapUpdate]:
+        got = updates()
+        taken.extend(got)
+        return got
+
+    beside._mapping.updates = recorded  # type: ignore[method-assign]
+    process_all(beside, 40)
+    beside._take_updates()
+    grown = [u for u in taken if u.new_keyframes][1:]
+    settled = [u for u in taken if not u.new_keyframes]
+    assert len(grown) == len(settled) > 3
+    for first, second in zip(grown, settled, strict=True):
+        assert second.version == first.version + 1
+        assert first.landmarks is not None and len(first.landmarks.ids) > 0
+        assert {k.id for k in first.new_keyframes} <= {k.id for k in second.keyframes}
+    (own,), known = beside._mapping.maps(), beside._tracking.map
+    assert known is not None and known.keyframes.keys() == own.keyframes.keys()
+    for i, keyframe in own.keyframes.items():
+        np.testing.assert_array_equal(known.keyframes[i].world_from_camera, keyframe.world_from_camera)
 
 
 def test_tracking_goes_on_while_mapping_is_behind(beside: Slam) -> None:

@@ -12,7 +12,7 @@ from thegra_core.geometry.alignment import umeyama
 from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
-from thegra_core.messages import Features, MapUpdate, TrackingState
+from thegra_core.messages import Features, Keyframe, MapUpdate, TrackingState
 from thegra_core.optimization.solver import BundleSolver
 from thegra_core.tracking.motion import MotionModel
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
@@ -65,6 +65,33 @@ def walk() -> Pair:
     pair = Pair()
     pair.run(cloud(count=600, seed=1, low=(-4, -3, 3), high=(8, 3, 8)), sideways(60, 0.05))
     return pair
+
+
+class PairByHalves(Pair):
+    """The same, but tracking gets a keyframe's landmarks before they are adjusted, and then where they are afterwards."""
+
+    def see(self, features: Features) -> TrackingOutput:
+        insert = self.mapper.insert
+
+        def by_halves(keyframe: Keyframe) -> MapUpdate:
+            self.tracking.apply(self.mapper.grow(keyframe))
+            return self.mapper.settle(keyframe)
+
+        self.mapper.insert = by_halves  # type: ignore[method-assign]
+        try:
+            return super().see(features)
+        finally:
+            self.mapper.insert = insert  # type: ignore[method-assign]
+
+
+def test_a_keyframe_in_halves_leads_to_the_same_poses(walk: Pair) -> None:
+    """The motion model follows both halves as it follows the whole."""
+    halves = PairByHalves()
+    halves.run(cloud(count=600, seed=1, low=(-4, -3, 3), high=(8, 3, 8)), sideways(60, 0.05))
+    for one, other in zip(walk.outputs, halves.outputs, strict=True):
+        assert one.result.state is other.result.state and (one.keyframe is None) is (other.keyframe is None)
+        if one.result.world_from_camera is not None:
+            np.testing.assert_allclose(other.result.world_from_camera, one.result.world_from_camera, atol=1e-6)
 
 
 def test_a_walk_is_tracked(walk: Pair) -> None:

@@ -71,17 +71,18 @@ class Mapper:
         return editor.take_update()
 
     def insert(self, keyframe: Keyframe) -> MapUpdate:
-        """Insert a keyframe: observations, culling, expansion with its neighbours, local bundle adjustment; then what it may tie together.
+        """Insert a keyframe: observations, culling, expansion with its neighbours, local bundle adjustment; then what it may tie together."""
+        self._grow(keyframe)
+        return self.settle(keyframe)
 
-        A full adjustment that is done comes in before the local one, which smooths the seams to what has come since.
-        """
+    def grow(self, keyframe: Keyframe) -> MapUpdate:
+        """The first half of `insert`, for a tracker that waits for the new landmarks: they are not adjusted yet. `settle` has to follow."""
+        self._grow(keyframe)
+        return self._editors[keyframe.map_id].take_update()
+
+    def settle(self, keyframe: Keyframe) -> MapUpdate:
+        """The second half of `insert`. A full adjustment that is done comes in before the local one, which smooths the seams to what has come since."""
         editor = self._editors[keyframe.map_id]
-        editor.add_keyframe(keyframe)
-        editor.connect(keyframe.id)
-        self._cull(editor, keyframe)
-        self._expand(editor, keyframe)
-        editor.connect(keyframe.id)
-        self._thin(editor, keyframe.id)
         self._full.collect(editor)
         adjust_locally(editor, keyframe.id, self._config)
         editor.connect(keyframe.id)
@@ -94,6 +95,15 @@ class Mapper:
             if merged is not None:
                 return merged
         return editor.take_update()
+
+    def _grow(self, keyframe: Keyframe) -> None:
+        editor = self._editors[keyframe.map_id]
+        editor.add_keyframe(keyframe)
+        editor.connect(keyframe.id)
+        self._cull(editor, keyframe)
+        self._expand(editor, keyframe)
+        editor.connect(keyframe.id)
+        self._thin(editor, keyframe.id)
 
     def finish(self, map_id: int) -> MapUpdate:
         """Full bundle adjustment of a map at the end of a run."""

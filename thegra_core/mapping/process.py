@@ -15,7 +15,7 @@ import sys
 import threading
 import traceback
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -202,27 +202,33 @@ def serve(connection: Connection) -> None:
                 mapping = InlineMapping(Mapper(camera, config, make_matcher(config), ProcessSolver()))
                 continue
             assert mapping is not None
-            answer = _do(mapping, name, arguments)
+            for answer in _do(mapping, name, arguments):
+                connection.send(answer)
+        except ConnectionError:  # who asked has gone
+            return
         except Exception as error:
             connection.send(("failed", error if isinstance(error, ThegraError) else traceback.format_exc()))
             return
-        if answer is not None:
-            connection.send(answer)
 
 
-def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...]) -> tuple[str, Any] | None:
-    if name in ("initialize", "insert", "drop"):
+def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...]) -> Iterator[tuple[str, Any]]:
+    """What is to be sent back, each as soon as it is there."""
+    if name == "insert":
+        for update in mapping.insert_by_halves(*arguments):
+            yield "updates", [update]
+    elif name in ("initialize", "drop"):
         getattr(mapping, name)(*arguments)
-        return "updates", mapping.updates()
-    if name == "call":
+        yield "updates", mapping.updates()
+    elif name == "call":
         function, *rest = arguments
-        return "result", function(*rest)
-    if name == "usage":
-        return "answer", own_usage()
-    try:
-        return "answer", getattr(mapping, name)(*arguments)
-    except ThegraError as error:
-        return "refusal", error
+        yield "result", function(*rest)
+    elif name == "usage":
+        yield "answer", own_usage()
+    else:
+        try:
+            yield "answer", getattr(mapping, name)(*arguments)
+        except ThegraError as error:
+            yield "refusal", error
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Protocol
@@ -91,6 +91,12 @@ class InlineMapping:
         """See `MappingService.insert`."""
         if keyframe.map_id in self._mapper.map_ids:
             self._updates.append(self._mapper.insert(keyframe))
+
+    def insert_by_halves(self, keyframe: Keyframe) -> Iterator[MapUpdate]:
+        """As `insert`, with an update before anything is adjusted: the new landmarks for a tracker that goes on meanwhile."""
+        if keyframe.map_id in self._mapper.map_ids:
+            yield self._mapper.grow(keyframe)
+            yield self._mapper.settle(keyframe)
 
     def drop(self, map_id: int) -> None:
         """See `MappingService.drop`."""

@@ -234,7 +234,7 @@ class TrackingStage:
             self._place.search_frames = self._config.relocalization.search_frames
 
     def apply(self, update: MapUpdate) -> None:
-        """Bring the replica up to date; the newest keyframe becomes the reference and the motion model follows its correction.
+        """Bring the replica up to date; a new keyframe becomes the reference, and the motion model follows the reference's correction.
 
         Updates of a map that was dropped in the meantime are ignored. Where the current map has become part of another, tracking goes on in that.
         """
@@ -247,11 +247,14 @@ class TrackingStage:
         else:
             return
         before = {m.id: m.world_from_camera for m in update.new_keyframes}
+        newest = max(before, default=place.reference_id)
+        if newest in place.map.keyframes:
+            before[newest] = place.map.keyframes[newest].world_from_camera.copy()
         place.take(update)
-        if before:
-            newest = max(before)
+        if update.new_keyframes:
             place.reference_id = place.last_keyframe_id = newest
             place.tracks.take(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
+        if newest in before and newest in place.map.keyframes:
             corrected = Similarity(place.map.keyframes[newest].world_from_camera, update.scales.get(newest, 1.0))
             place.motion.move(corrected @ Similarity(before[newest]).inverse())
 
