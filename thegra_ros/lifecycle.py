@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import threading
 import traceback
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
@@ -16,6 +18,9 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from thegra_core.errors import ThegraError
 from thegra_ros.answers import answering
 from thegra_ros.qos import publisher_options, subscription_options
+
+LAST_WORDS_S = 2.5
+"""How long a node that is told to end may take to release what it holds."""
 
 
 class ManagedNode(LifecycleNode):
@@ -151,7 +156,11 @@ class ManagedNode(LifecycleNode):
 
 
 def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = None) -> int:
-    """Run a node until it is told to end (SIGINT, SIGTERM); the exit code: 0, or 2 if it could not start."""
+    """Run a node until it is told to end (SIGINT, SIGTERM); the exit code: 0, or 2 if it could not start. The process has to end with it.
+
+    Where it has not ended `LAST_WORDS_S` later it is ended: a transport that waits for a partner that was killed keeps no node alive.
+    """
+    code = 2
     try:
         rclpy.init(args=arguments)
     except Exception as error:  # RCLError is no public class
@@ -162,22 +171,35 @@ def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = 
     try:
         node = make()
         executor.add_node(node)
-        if not node.start():
-            return 2 if rclpy.ok() else 0
-        executor.spin()
+        if node.start():
+            executor.spin()
+            code = 0
+        elif not rclpy.ok():
+            code = 0
     except ThegraError as error:
         rclpy.logging.get_logger("thegra").error(str(error))
-        return 2
     except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
+        code = 0
     except Exception:
         if rclpy.ok():
             raise
-        return 0  # told to end while it was still being made
+        code = 0  # told to end while it was still being made
     finally:
+        _end_in_time(code)
         if node is not None:
             node.end()
             executor.remove_node(node)
             node.destroy_node()
         rclpy.try_shutdown()
-    return 0
+    return code
+
+
+def _end_in_time(code: int) -> None:
+    def end() -> None:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+    timer = threading.Timer(LAST_WORDS_S, end)
+    timer.daemon = True
+    timer.start()
