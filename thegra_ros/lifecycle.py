@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
@@ -19,6 +20,7 @@ from thegra_core.errors import ThegraError
 from thegra_ros.answers import answering
 from thegra_ros.qos import publisher_options, subscription_options
 
+WATCH_S = 0.1
 LAST_WORDS_S = 2.5
 """How long a node that is told to end may take to release what it holds."""
 
@@ -166,6 +168,7 @@ def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = 
     except Exception as error:  # RCLError is no public class
         sys.stderr.write(f"thegra: ROS arguments not understood: {error}\n")
         return 2
+    _end_in_time()
     node: ManagedNode | None = None
     executor = SingleThreadedExecutor()
     try:
@@ -185,7 +188,6 @@ def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = 
             raise
         code = 0  # told to end while it was still being made
     finally:
-        _end_in_time(code)
         if node is not None:
             node.end()
             executor.remove_node(node)
@@ -194,12 +196,15 @@ def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = 
     return code
 
 
-def _end_in_time(code: int) -> None:
-    def end() -> None:
+def _end_in_time() -> None:
+    """Watch the context: once it is shut down, by a signal or by `run_node` itself, what holds the process up may do so no longer."""
+
+    def watch() -> None:
+        while rclpy.ok():
+            time.sleep(WATCH_S)
+        time.sleep(LAST_WORDS_S)
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(code)
+        os._exit(0)
 
-    timer = threading.Timer(LAST_WORDS_S, end)
-    timer.daemon = True
-    timer.start()
+    threading.Thread(target=watch, daemon=True, name="end in time").start()
