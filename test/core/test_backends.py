@@ -17,11 +17,12 @@ from thegra_core.features.registry import make_extractor
 from thegra_core.features.weights import path_of
 
 CPU = torch.device("cpu")
+EXTRAS = {"onnxruntime": "onnx", "openvino": "openvino"}
 
 
 def installed(runtime: str) -> None:
     for module in (runtime, "onnx", "onnxscript"):
-        pytest.importorskip(module)
+        pytest.importorskip(module, reason=f"NOT TESTED, {module} is not installed: pip install -e .[{EXTRAS[runtime]}]")
 
 
 class Small(torch.nn.Module):
@@ -62,7 +63,7 @@ def test_xfeat_finds_the_same_in_every_runtime(runtime: str, tmp_path: Path, mon
     try:
         weights = path_of("xfeat")
     except WeightsError as error:
-        pytest.skip(str(error))
+        pytest.skip(f"NOT TESTED, {error}")
     image = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (128, 160), np.uint8), (0, 0), 2)
     image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX)
     expected = make_extractor(ExtractorConfig(name="xfeat", max_keypoints=200)).extract(image, 0)
