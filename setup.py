@@ -41,7 +41,7 @@ EXTRAS = {
     "openvino": [*ONNX[:2], "openvino>=2024.6"],
     "sim": SIM,
     "test": TEST,
-    "dev": [*TEST, *DASK, "ruff>=0.5", "mypy>=1.10", "types-PyYAML", "import-linter>=2.1"],
+    "dev": [*TEST, *DASK, *ONNX, "ruff>=0.5", "mypy>=1.10", "types-PyYAML", "import-linter>=2.1"],
     "dask": DASK,
     "viz": ["rerun-sdk>=0.23"],
     "ros": [
