@@ -7,6 +7,7 @@ Sources named in the descriptions: `paper` = arXiv 2602.08531; `ORB-SLAM3` = Cam
 from __future__ import annotations
 
 import importlib.resources
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -378,6 +379,21 @@ def load_config(profile: str | None = None, file: Path | None = None, overrides:
     except ValidationError as error:
         lines = [f"  {'.'.join(str(part) for part in e['loc'])}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
         raise ConfigError("configuration not understood:\n" + "\n".join(lines) + "\nlist the parameters with: thegra config") from error
+
+
+def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
+    """Overrides for `load_config` from `KEY=VALUE` texts, as the options `--set` take them.
+
+    Raises:
+        ConfigError: If one is of another form.
+    """
+    overrides: dict[str, Any] = {}
+    for assignment in assignments:
+        key, equals, value = assignment.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"--set {assignment}: write KEY=VALUE, e.g. --set extractor.max_keypoints=2048; the keys are listed by: thegra config")
+        overrides[key.strip()] = value
+    return overrides
 
 
 def dump_config(config: ThegraConfig) -> str:

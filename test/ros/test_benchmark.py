@@ -78,4 +78,5 @@ def test_memory_stays_over_many_turns(recording_path: Path, minutes: int, warm_u
     told = json.loads(done.stdout)
     turns = done.stderr.count("a new map begins")
     assert turns > 5 and told["images"] > 100
+    assert told["tracking_pct"] > 20, "a system that has no map tells nothing about the memory of one"
     assert told["growth_pct"] < told["most_growth_pct"]

@@ -171,10 +171,10 @@ def growth(
     from rich.console import Console
     from rich.progress import Progress
 
-    from thegra_core.config import load_config
+    from thegra_core.config import load_config, parse_assignments
     from thegra_core.evaluation.benchmark import growth as logic
 
-    config = load_config("quality", overrides={"preprocessing.filters": "[]"} | dict(_assignment(text) for text in set_ or ()))
+    config = load_config("quality", overrides={"preprocessing.filters": "[]"} | parse_assignments(set_ or ()))
     folder = out or Path("runs") / f"growth_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("walking", total=None)
@@ -187,13 +187,6 @@ def growth(
     for name, value in told.items():
         print(f"{name:18} {value}")
     print(f"figure             {folder / 'growth.png'}")
-
-
-def _assignment(text: str) -> tuple[str, str]:
-    key, separator, value = text.partition("=")
-    if not separator:
-        raise ConfigError(f"--set {text}: write KEY=VALUE")
-    return key, value
 
 
 def _frames_of(recordings: Sequence[Path], count: int) -> list[ImageArray]:

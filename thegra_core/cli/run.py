@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from thegra_core.cli import exit_codes
 from thegra_core.cli.progress import News, Progress, headline, make_progress, print_summary
-from thegra_core.config import ThegraConfig, load_config
-from thegra_core.errors import ConfigError, InputError, ThegraError
+from thegra_core.config import ThegraConfig, load_config, parse_assignments
+from thegra_core.errors import InputError, ThegraError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame, MapSummary, Run, Snapshot, TrackingResult
 from thegra_core.outputs.metrics import Timing
@@ -291,12 +291,7 @@ def _check_options(options: RunOptions) -> None:
 
 
 def _overrides(options: RunOptions) -> dict[str, Any]:
-    overrides: dict[str, Any] = {}
-    for assignment in options.assignments:
-        key, equals, value = assignment.partition("=")
-        if not equals or not key:
-            raise ConfigError(f"--set {assignment}: write KEY=VALUE, e.g. --set extractor.max_keypoints=2048; the keys are listed by: thegra config")
-        overrides[key.strip()] = value
+    overrides = parse_assignments(options.assignments)
     return overrides if options.seed is None else overrides | {"seed": options.seed}
 
 

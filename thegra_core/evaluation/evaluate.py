@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from thegra_core.config import load_config
+from thegra_core.config import load_config, parse_assignments
 from thegra_core.errors import InputError
 from thegra_core.evaluation.datasets.sequence import DataSequence, Found, Missing
 from thegra_core.evaluation.scores import Settings, score_fitted
@@ -70,7 +70,7 @@ def plan_jobs(plan: Plan) -> list[Job]:
         ConfigError: If a profile or an assignment is not understood.
     """
     for profile in plan.profiles:
-        load_config(profile, None, dict(a.partition("=")[::2] for a in plan.assignments))
+        load_config(profile, None, parse_assignments(plan.assignments))
     jobs = []
     for sequence in plan.found.sequences:
         truth, told = _reference(sequence, plan.out / sequence.name)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from thegra_core.config import ThegraConfig, load_config
+from thegra_core.config import ThegraConfig, load_config, parse_assignments
 from thegra_core.errors import ConfigError
 from thegra_ros.commands import need_ros
 
@@ -75,7 +75,7 @@ def soak(
     set_: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Play a recording over and over into the node and watch its memory. Exit code 1: it grew by more than 5 % after the warm-up.
+    """Play a recording over and over into the node and watch its memory. Exit code 1: it grew by more than 5 % after the warm-up, or nothing was tracked then.
 
     Example: `thegra benchmark soak flight.mcap --minutes 10 --rate 15`
     """
@@ -98,18 +98,14 @@ def soak(
             f"{content['graph']}, {minutes:g} minutes at {rate:g} frames a second: {content['images']} images received, {content['dropped']} of them dropped, "
             f"tracking for {content['tracking_pct']} % of the time\nmemory {content['warm_mb']} MB after {warm_up:g} s, from then on growth {content['growth_pct']} %, peak {content['peak_mb']} MB"
         )
-    if content["growth_pct"] > content["most_growth_pct"]:
+    if content["tracking_pct"] == 0:
+        typer.echo("nothing was tracked after the warm-up: this says nothing about the memory of a map; take a lower --rate", err=True)
+    if content["growth_pct"] > content["most_growth_pct"] or content["tracking_pct"] == 0:
         raise typer.Exit(1)
 
 
 def _config(profile: str, assignments: Sequence[str] | None) -> ThegraConfig:
-    overrides = {}
-    for text in assignments or LIGHT:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise ConfigError(f"--set {text}: write KEY=VALUE; the keys are listed by: thegra config")
-        overrides[key.strip()] = value
-    return load_config(profile, overrides=overrides)
+    return load_config(profile, overrides=parse_assignments(assignments or LIGHT))
 
 
 @contextmanager

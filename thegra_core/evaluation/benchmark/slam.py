@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from thegra_core.config import load_config
-from thegra_core.errors import ConfigError, InputError
+from thegra_core.config import load_config, parse_assignments
+from thegra_core.errors import InputError
 from thegra_core.evaluation.benchmark.peers import best_peer, median_or_none
 from thegra_core.evaluation.scores import read_intervals, read_stamps
 from thegra_core.evaluation.tasks import RAN, run_process
@@ -94,7 +94,7 @@ def planned_runs(plan: Plan) -> list[PlannedRun]:
     if unknown:
         raise InputError(f"--max-frames {unknown[0]}=...: no recording is called that; there are {', '.join(names)}")
     for profile in plan.profiles:
-        load_config(profile, None, _overrides(plan.assignments))
+        load_config(profile, None, parse_assignments(plan.assignments))
     return [
         PlannedRun(path, profile, seed, plan.out / name / profile / f"seed{seed}", plan.max_frames.get(name))
         for path, name in zip(plan.recordings, names, strict=True)
@@ -259,11 +259,3 @@ def write_report(plan: Plan, content: Mapping[str, Any], markdown: str) -> None:
 def recording_name(path: Path) -> str:
     """Name of a recording in results and options: that of its folder or file."""
     return path.resolve().name
-
-
-def _overrides(assignments: Sequence[str]) -> dict[str, Any]:
-    pairs = [assignment.partition("=") for assignment in assignments]
-    wrong = next((assignment for assignment, (key, equals, _) in zip(assignments, pairs, strict=True) if not key or not equals), None)
-    if wrong is not None:
-        raise ConfigError(f"--set {wrong}: write KEY=VALUE, e.g. --set extractor.max_keypoints=2048; the keys are listed by: thegra config")
-    return {key.strip(): value for key, _, value in pairs}
