@@ -31,7 +31,7 @@ help: ## show this list
 setup: $(VENV)/.weights ## make .venv with everything in it and fetch the networks' weights (does nothing when up to date)
 
 demo: setup $(DEMO_BAG)/metadata.yaml ## track a small simulated recording and name the report
-	$(BIN)/thegra run $(DEMO_BAG) --profile fast --out $(DEMO_OUT)
+	$(BIN)/thegra run $(DEMO_BAG) --profile realtime --out $(DEMO_OUT)
 	@echo "Report: $(DEMO_OUT)/report.html"
 
 test: setup ## run the tests (no recordings needed)
