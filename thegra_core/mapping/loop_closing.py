@@ -17,7 +17,7 @@ from thegra_core.mapping.chaining import MatchGraph
 from thegra_core.messages import NO_LANDMARK, Revisit
 from thegra_core.optimization.pose_graph import Edge, optimize_pose_graph
 from thegra_core.places.index import PlaceIndex
-from thegra_core.places.verification import Sighting, agree, is_drift, sight
+from thegra_core.places.verification import Sighting, agree, more_than_drift, sight
 
 logger = logging.getLogger(__name__)
 ESSENTIAL_NEIGHBOURS = 5
@@ -59,10 +59,11 @@ class LoopCloser:
             near = [i for i in current.neighbours(candidate, len(current.keyframes)) if i not in connected]
             found = sight(current, keyframe_id, current, [candidate, *near[: self.config.loop.group - 1]], self.matcher, self.config)
             if isinstance(found, Sighting):
-                if is_drift(current, found, self.config.loop):
+                excess = more_than_drift(current, found, self.config.loop)
+                if not excess:
                     return found
-                found = "the way between cannot have drifted so far"
-            logger.debug("keyframe %d looks like %d: %s", keyframe_id, candidate, found)
+                found = excess
+            logger.info("keyframe %d looks like %d: %s", keyframe_id, candidate, found)
         return None
 
 

@@ -122,14 +122,19 @@ class Mapper:
         save_map(path, kept, self._config)
 
     def save_largest(self, path: Path) -> None:
-        """Write the map with most keyframes, the older of equals.
+        """Write the largest map.
 
         Raises:
             InputError: If there is none, or the file cannot be written.
         """
         if not self._editors:
             raise InputError(f"there is no map yet that could be written to {path}")
-        self.save(max(self._editors, key=lambda i: (len(self._editors[i].map.keyframes), -i)), path)
+        self.save(self.largest, path)
+
+    @property
+    def largest(self) -> int:
+        """The map with most keyframes, the older of equals; there has to be one."""
+        return max(self._editors, key=lambda i: (len(self._editors[i].map.keyframes), -i))
 
     def load(self, path: Path) -> MapUpdate:
         """Take a map from a file, beside those that are there; returns the whole of it as an update.

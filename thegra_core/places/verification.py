@@ -71,8 +71,8 @@ def sight(new: Map, keyframe_id: int, old: Map, group: list[int], matcher: Match
     return Sighting(keyframe_id, Similarity(poses.inverse(estimate.camera_from_world), scale), keypoints, landmarks, matched)
 
 
-def is_drift(current: Map, sighting: Sighting, config: LoopConfig) -> bool:
-    """Whether a sighting of the same map moves its keyframe by no more than what may have drifted on the way since the old place.
+def more_than_drift(current: Map, sighting: Sighting, config: LoopConfig) -> str:
+    """How a sighting of the same map moves its keyframe by more than what may have drifted on the way since the old place; empty if it does not.
 
     Buildings repeat themselves: what looks alike at another place asks for a correction as large as the way between the two. A drift of scale by itself
     moves what lies behind the camera, by half the way for each factor of e.
@@ -85,7 +85,9 @@ def is_drift(current: Map, sighting: Sighting, config: LoopConfig) -> bool:
     way = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
     moved = float(np.linalg.norm(sighting.world_from_camera.rigid[:3, 3] - estimated.rigid[:3, 3]))
     turned = np.degrees(poses.rotation_angle(correction.rigid[:3, :3]))
-    return bool(turned <= config.max_drift_deg and moved <= (config.max_drift_ratio + 0.5 * abs(np.log(correction.scale))) * way)
+    if turned <= config.max_drift_deg and moved <= (config.max_drift_ratio + 0.5 * abs(np.log(correction.scale))) * way:
+        return ""
+    return f"{len(sighting.keypoints)} landmarks agree, but would turn it by {turned:.0f} degrees and move it by {moved / max(way, 1e-9):.2f} of the way since"
 
 
 def agree(new: Map, one: Sighting, other: Sighting, config: ThegraConfig) -> bool:

@@ -100,7 +100,7 @@ class MappingNode(StageNode):
         if not mapper.map_ids:
             self._send("empty", [word(question)], stamp)
             return
-        main = _main_map(mapper)
+        main = mapper.largest
         keyframes = max(max(mapper.map(i).keyframes) for i in mapper.map_ids)
         taken = {**question, "next_map": str(max(mapper.map_ids) + 1), "next_keyframe": str(keyframes + 1)}
         self._send("resume", [word(taken), *update_tables(mapper.whole(main))], stamp)
@@ -132,9 +132,9 @@ class MappingNode(StageNode):
         self._outputs.publish(stamp, mapper.summary(map_id), self._place.frames)
 
     def _save(self, path: Path) -> str:
-        if self._mapper is None or not self._mapper.map_ids:
+        if self._mapper is None:
             raise InputError(f"there is no map yet that could be written to {path}")
-        self._mapper.save(_main_map(self._mapper), path)
+        self._mapper.save_largest(path)
         return f"the map is in {path}"
 
     def _load(self, path: Path) -> str:
@@ -167,11 +167,6 @@ class MappingNode(StageNode):
         record = self._assembler.add(cloud)
         if record is not None:
             self.enqueue((*record, stamp_ns(cloud), cloud.header.frame_id))
-
-
-def _main_map(mapper: Mapper) -> int:
-    """The map with most keyframes."""
-    return max(mapper.map_ids, key=lambda i: (len(mapper.map(i).keyframes), -i))
 
 
 def main() -> None:
