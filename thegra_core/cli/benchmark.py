@@ -200,6 +200,7 @@ def places(
     every: Annotated[int, typer.Option(min=1, metavar="N", help="Use every N-th frame.")] = 1,
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=2, metavar="N", help="Frames of each recording at the most.")] = None,
     trials: Annotated[int, typer.Option(min=1, metavar="N", help="Times that the camera is set down in its own map.")] = 20,
+    shown: Annotated[int, typer.Option(min=1, metavar="N", help="Frames of each other recording that a map is shown.")] = 20,
     gap: Annotated[float, typer.Option(min=0.0, metavar="S", help="Seconds without a frame between the recordings.")] = 0.0,
     cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for results.json, results.md and thegra.log. Default: runs/places_TIME.")] = None,
@@ -225,7 +226,7 @@ def places(
 
     config = load_config(profile, overrides=parse_assignments(set_ or ()))
     set_threads(config.threads)
-    plan = logic.Plan(tuple(check or logic.CHECKS), gap, trials, tuple(set_ or ()))
+    plan = logic.Plan(tuple(check or logic.CHECKS), gap, trials, shown, tuple(set_ or ()))
     paths = [*(recordings or ()), *(_suite(suite_dir, only) if suite else [])]
     if not paths:
         raise InputError("nothing to join: name recordings, or add --suite for the simulated ones")

@@ -35,6 +35,11 @@ class Clip:
         """The way back: the same images in the opposite order, without the last one, where it begins."""
         return replace(self, frames=self.frames[-2::-1])
 
+    def seen_by(self, camera: CameraModel) -> Clip:
+        """The same frames as another camera at the same places would have shown them."""
+        view = View(self.camera, camera)
+        return replace(self, camera=camera, frames=tuple(replace(frame, image=view(frame.image)) for frame in self.frames))
+
 
 @dataclass(frozen=True, slots=True)
 class Joined:
@@ -44,12 +49,6 @@ class Joined:
     frames: tuple[Frame, ...]
     part: IntArray
     source: IntArray
-
-
-    def seen_by(self, camera: CameraModel) -> Clip:
-        """The same frames as another camera at the same places would have shown them."""
-        view = View(self.camera, camera)
-        return replace(self, camera=camera, frames=tuple(replace(frame, image=view(frame.image)) for frame in self.frames))
 
 
 def read_clip(path: Path, every: int = 1, max_frames: int | None = None) -> Clip:

@@ -340,6 +340,8 @@ class TrackingStage:
 
     def _accept(self, place: _Place, features: Features, found: Localization, matches: Matches) -> TrackingOutput:
         if place.lost_frames:
+            told = "found again at %.3f s in map %d after %d frames: %d landmarks agree, %d should be seen from there"
+            logger.info(told, features.stamp_ns / 1e9, place.map.map_id, place.lost_frames, found.inliers, len(found.visible_ids))
             place.lost_frames = 0
             self.relocalizations += 1
             place.motion.reset()

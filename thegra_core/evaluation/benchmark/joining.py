@@ -62,19 +62,24 @@ def title(plan: Joining) -> str:
 def run_one(clips: Mapping[str, Clip], plan: Joining, gap_s: float, settings: Settings) -> dict[str, Any]:
     """Figures and verdict of one joined recording."""
     joined = join([clips[part.name].backwards() if part.backwards else clips[part.name] for part in plan], gap_s)
+    return judge(run(joined, settings), plan, joined)
+
+
+def run(joined: Joined, settings: Settings) -> Run:
+    """A joined recording through the system."""
     slam = Slam(joined.camera, settings.config, settings.extractor, settings.matcher)
     for frame in joined.frames:
         slam.process(frame)
-    return judge(slam.finish(), plan, joined)
+    return slam.finish()
 
 
-def judge(run: Run, plan: Joining, joined: Joined) -> dict[str, Any]:
+def judge(finished: Run, plan: Joining, joined: Joined) -> dict[str, Any]:
     """What a run made of a joined recording.
 
     `false_poses`: poses in a map of another scene, which is the scene with most poses in it. `found_again_pct`: of the images that come back later, those whose
     second sight is in the map of their first; `apart`: median distance of the two, over the extent of the first clip's poses. None where nothing comes back.
     """
-    placed = [f for f in run.frames if f.world_from_camera is not None]
+    placed = [f for f in finished.frames if f.world_from_camera is not None]
     scene_of = {name: i for i, name in enumerate(dict.fromkeys(part.name for part in plan))}
     scenes = np.array([scene_of[plan[part].name] for part in joined.part.tolist()])
     false = 0
@@ -85,7 +90,7 @@ def judge(run: Run, plan: Joining, joined: Joined) -> dict[str, Any]:
     result: dict[str, Any] = {
         "parts": [str(part) for part in plan], "frames": len(joined.frames),
         "tracked_pct": [round(100.0 * sum(joined.part[f.index] == i for f in placed) / int((joined.part == i).sum()), 1) for i in range(len(plan))],
-        "maps": len(run.maps), "losses": run.losses, "relocalizations": run.relocalizations, "loops": run.loops, "merges": run.merges,
+        "maps": len(finished.maps), "losses": finished.losses, "relocalizations": finished.relocalizations, "loops": finished.loops, "merges": finished.merges,
         "false_poses": false, "found_again_pct": found, "apart": apart,
     }  # fmt: skip
     return result | {"verdict": _verdict(result)}

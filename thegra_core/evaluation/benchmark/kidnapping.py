@@ -93,16 +93,18 @@ def _first_found(place: KnownPlace, numbers: Sequence[int], settings: Settings) 
     return None
 
 
-def benchmark(clips: Sequence[Clip], trials: int, settings: Settings, say: Callable[[str], None]) -> list[dict[str, Any]]:
+def benchmark(clips: Sequence[Clip], trials: int, shown: int, settings: Settings, say: Callable[[str], None]) -> Iterator[dict[str, Any]]:
     """Each clip's map, shown its own place and all others.
 
-    Returns:
+    Args:
+        shown: Frames of each other clip that a map is shown, evenly spread.
+
+    Yields:
         For each map: `found`, `elsewhere` and `lost` trials in its own place, and `claims`: by the name of another clip, the poses that were claimed there, each
         with the landmarks that agree and those that should have been seen.
     """
     camera = common_camera([clip.camera for clip in clips])
     seen = [clip.seen_by(camera) for clip in clips]
-    results = []
     with tempfile.TemporaryDirectory() as folder:
         for clip in seen:
             say(f"a map of {clip.name}")
@@ -114,7 +116,10 @@ def benchmark(clips: Sequence[Clip], trials: int, settings: Settings, say: Calla
                 if other.name != clip.name:
                     say(f"{other.name} in the map of {clip.name}")
                     claims[other.name] = [
-                        [r.inliers, r.visible] for r in set_down(place, other.frames, settings) if r.state is TrackingState.TRACKING
+                        [r.inliers, r.visible] for r in set_down(place, _spread(other.frames, shown), settings) if r.state is TrackingState.TRACKING
                     ]  # fmt: skip
-            results.append({"map": clip.name, "found": told.count(True), "elsewhere": told.count(False), "lost": told.count(None), "claims": claims})
-    return results
+            yield {"map": clip.name, "found": told.count(True), "elsewhere": told.count(False), "lost": told.count(None), "claims": claims}
+
+
+def _spread(frames: Sequence[Frame], count: int) -> list[Frame]:
+    return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int)).tolist()]

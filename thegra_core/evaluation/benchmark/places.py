@@ -25,11 +25,13 @@ MIN_FOUND = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What to check. gap_s: seconds without a frame between joined clips; trials: of kidnapping in each map; assignments: told in the results."""
+    """What to check. gap_s: seconds without a frame between joined clips; trials: of kidnapping in each map; shown: frames
+    of each other recording that it is shown; assignments: told in the results."""
 
     checks: tuple[str, ...] = CHECKS
     gap_s: float = 0.0
     trials: int = 20
+    shown: int = 20
     assignments: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -53,7 +55,7 @@ def benchmark(clips: Mapping[str, Clip], plan: Plan, settings: Settings, out: Pa
         content["joined"].append(joining.run_one(clips, which, plan.gap_s, settings))
         write_report(Folder((), out), content, markdown(content))
     if KIDNAPPED in plan.checks:
-        for told in kidnapping.benchmark(list(clips.values()), plan.trials, settings, say):
+        for told in kidnapping.benchmark(list(clips.values()), plan.trials, plan.shown, settings, say):
             content["kidnapped"].append(told)
             write_report(Folder((), out), content, markdown(content))
     return content
@@ -87,7 +89,7 @@ def markdown(content: Mapping[str, Any]) -> str:
         rows = [(r["map"], *(_kidnapped(r, name) for name in names)) for r in content["kidnapped"]]
         explained = (
             "A map of every other frame, one a row, and the camera set down at unseen frames of the same recording: found / trials. Frames of other recordings, in a "
-            "column each: poses claimed."
+            "column each: poses claimed in it."
         )
         told = [_table(("map", *names), rows), explained, *told]
     return "\n\n".join([*told, *(f"Wrong: {line}" for line in wrong(content))]) + "\n"
