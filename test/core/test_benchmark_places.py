@@ -96,9 +96,16 @@ def test_a_place_that_is_not_found_again_is_told() -> None:
 def test_a_kidnapped_camera_that_is_found_elsewhere_is_told(tmp_path: Path) -> None:
     clips, settings = made(OTHER)
     place = kidnapping.known_place(clips["one"], settings, tmp_path / "one.map")
-    assert 8 <= len(place.unseen()) <= 12
+    assert place is not None and 8 <= len(place.unseen()) <= 12
     assert kidnapping.kidnap(place, 3, settings) == [True] * 3
     moved = kidnapping.KnownPlace(place.clip, place.file, {i: position + 1.0 for i, position in place.positions.items()})
     assert kidnapping.kidnap(moved, 3, settings) == [False] * 3
     lost = kidnapping.KnownPlace(clips["two"], place.file, place.positions)
     assert kidnapping.kidnap(lost, 1, settings) == [None]
+
+
+def test_a_clip_that_makes_no_map_is_told(tmp_path: Path) -> None:
+    clips, settings = made(OTHER)
+    still = Clip("still", CAMERA, clips["one"].frames[:1] * 6)
+    content = {"frames": {"still": 6}, "joined": [], "kidnapped": list(kidnapping.benchmark([still], 2, 2, settings, lambda _: None))}
+    assert places.wrong(content) == ["no map of still"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thegra_core.config import LoopConfig, ThegraConfig
+from thegra_core.config import LoopConfig, ThegraConfig, TrackingConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry import poses
 from thegra_core.geometry.similarity import Similarity
@@ -62,7 +62,7 @@ def sight(new: Map, keyframe_id: int, old: Map, group: list[int], matcher: Match
     keypoints, landmarks, points = keypoints[estimate.inliers], landmarks[estimate.inliers], points[estimate.inliers]
     if len(keypoints) < settings.min_inliers:
         return f"{len(keypoints)} landmarks agree with one pose"
-    visible = _visible(old, list(matched), estimate.camera_from_world, config)
+    visible = len(should_be_seen(old, list(matched), estimate.camera_from_world, config.tracking))
     if len(keypoints) < settings.min_visible_share * visible:
         return f"{len(keypoints)} landmarks agree with one pose, {visible} should be seen from there"
     scale = _scale(new, keyframe, keypoints, poses.apply(estimate.camera_from_world, points)[:, 2], config)
@@ -104,11 +104,11 @@ def agree(new: Map, one: Sighting, other: Sighting, config: ThegraConfig) -> boo
     )
 
 
-def _visible(old: Map, group: list[int], camera_from_world: NDArray[np.float64], config: ThegraConfig) -> int:
-    """How many of the landmarks that keyframes of the old place see a camera should see."""
-    ids = np.unique(np.concatenate([old.keyframes[i].landmark_ids for i in group]))
-    alive = ids[old.landmarks.rows(ids) >= 0]
-    return len(visible_landmarks(old.landmarks, alive, camera_from_world, old.camera, config.tracking).ids)
+def should_be_seen(place: Map, group: list[int], camera_from_world: NDArray[np.float64], config: TrackingConfig) -> IntArray:
+    """Ids (V,) of the landmarks that keyframes `group` of a place see and a camera there should see, too."""
+    ids = np.unique(np.concatenate([place.keyframes[i].landmark_ids for i in group]))
+    alive = ids[place.landmarks.rows(ids) >= 0]
+    return visible_landmarks(place.landmarks, alive, camera_from_world, place.camera, config).ids
 
 
 def _scale(new: Map, keyframe: MapKeyframe, keypoints: IntArray, old_depth: NDArray[np.float64], config: ThegraConfig) -> float | str:

@@ -295,7 +295,7 @@ class TrackingStage:
             if features.stamp_ns in keyframe_stamps:
                 continue
             candidates = self._place.places.query(features, 2) if self._place.resumed else nearest_in_time(current, features.stamp_ns, 2)
-            found = relocalize(current, features, candidates, self._matcher, self._config, self._config.relocalization.min_inliers)
+            found = relocalize(current, features, candidates, self._matcher, self._config, nearby=False)
             if found is not None:
                 relative = current.keyframes[found[1]].camera_from_world @ found[0].world_from_camera
                 placed.append(LateLocalization(features.stamp_ns, current.map_id, found[1], relative))
@@ -434,12 +434,12 @@ class TrackingStage:
     def _seek(self, place: _Place, features: Features, matches: Matches) -> tuple[Localization, int, Matches] | None:
         """Match a frame to the last keyframes or, once it is lost, to those that look most alike; `matches` are to the reference."""
         settings = self._config.relocalization
-        if place.lost_frames == 0:
+        nearby = place.lost_frames == 0
+        if nearby:
             candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
         else:
             candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
-        least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
-        return relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
+        return relocalize(place.map, features, candidates, self._matcher, self._config, nearby, {place.reference_id: matches})
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:

@@ -50,17 +50,15 @@ class KnownPlace:
         return bool(off < _TOLERANCE * np.linalg.norm(after - before) + _NEAR)
 
 
-def known_place(clip: Clip, settings: Settings, file: Path) -> KnownPlace:
-    """A map of every other frame of a clip.
-
-    Raises:
-        InputError: If no map came of it.
-    """
+def known_place(clip: Clip, settings: Settings, file: Path) -> KnownPlace | None:
+    """A map of every other frame of a clip; None if there came none of it."""
     slam = Slam(clip.camera, settings.config, settings.extractor, settings.matcher)
     numbers = {frame.stamp_ns: number for number, frame in enumerate(clip.frames)}
     for frame in clip.frames[::EVERY]:
         slam.process(frame)
     run = slam.finish()
+    if not run.maps:
+        return None
     slam.save_map(file)
     return KnownPlace(clip, file, {numbers[f.stamp_ns]: f.world_from_camera[:3, 3] for f in run.frames if f.world_from_camera is not None and f.map_id == run.main_map_id})
 
@@ -100,8 +98,8 @@ def benchmark(clips: Sequence[Clip], trials: int, shown: int, settings: Settings
         shown: Frames of each other clip that a map is shown, evenly spread.
 
     Yields:
-        For each map: `found`, `elsewhere` and `lost` trials in its own place, and `claims`: by the name of another clip, the poses that were claimed there, each
-        with the landmarks that agree and those that should have been seen.
+        For each clip, under `map`: `found`, `elsewhere` and `lost` trials in its own place, and `claims`: by the name of another clip, the poses that were claimed
+        there, each with the landmarks that agree and those that should have been seen. `found` is None where there came no map of it.
     """
     camera = common_camera([clip.camera for clip in clips])
     seen = [clip.seen_by(camera) for clip in clips]
@@ -109,16 +107,21 @@ def benchmark(clips: Sequence[Clip], trials: int, shown: int, settings: Settings
         for clip in seen:
             say(f"a map of {clip.name}")
             place = known_place(clip, settings, Path(folder) / "place.map")
+            if place is None:
+                yield {"map": clip.name, "found": None, "elsewhere": 0, "lost": 0, "claims": {}}
+                continue
             say(f"{clip.name} in its own map")
             told = kidnap(place, trials, settings)
             claims = {}
             for other in seen:
                 if other.name != clip.name:
                     say(f"{other.name} in the map of {clip.name}")
-                    claims[other.name] = [
-                        [r.inliers, r.visible] for r in set_down(place, _spread(other.frames, shown), settings) if r.state is TrackingState.TRACKING
-                    ]  # fmt: skip
+                    claims[other.name] = _claims(place, _spread(other.frames, shown), settings)
             yield {"map": clip.name, "found": told.count(True), "elsewhere": told.count(False), "lost": told.count(None), "claims": claims}
+
+
+def _claims(place: KnownPlace, frames: Sequence[Frame], settings: Settings) -> list[list[int]]:
+    return [[r.inliers, r.visible] for r in set_down(place, frames, settings) if r.state is TrackingState.TRACKING]
 
 
 def _spread(frames: Sequence[Frame], count: int) -> list[Frame]:

@@ -65,6 +65,9 @@ def wrong(content: Mapping[str, Any]) -> list[str]:
     """One line for each place that was taken for another one, or not found again."""
     told = [f"{' + '.join(r['parts'])}: {r['verdict']}" for r in content["joined"] if r["verdict"].startswith("wrong")]
     for result in content["kidnapped"]:
+        if result["found"] is None:
+            told.append(f"no map of {result['map']}")
+            continue
         trials = result["found"] + result["elsewhere"] + result["lost"]
         if result["elsewhere"] or result["found"] < MIN_FOUND * trials:
             told.append(f"kidnapped in {result['map']}: found {result['found']} of {trials} times, elsewhere {result['elsewhere']} times")
@@ -100,6 +103,8 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _kidnapped(result: Mapping[str, Any], name: str) -> str:
+    if result["found"] is None:
+        return "–"
     if name != result["map"]:
         return str(len(result["claims"][name]))
     elsewhere = f", {result['elsewhere']} elsewhere" if result["elsewhere"] else ""
