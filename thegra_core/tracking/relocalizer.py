@@ -24,10 +24,9 @@ def relocalize(
     """Place the frame by its matches to all candidate keyframes together; also the keyframe that shares most with it and the matches to that one.
 
     One keyframe alone may share too little with a frame that comes back after a gap; what several share adds up. `known` matches are not made again.
-    nearby: the camera was at these keyframes just now, so that less evidence will do. From anywhere, streets and rooms have much that looks alike (cars,
-    windows): a pose is taken only where it shows enough of what should be seen from there.
+    nearby: the camera was at these keyframes just now, and a pose that tracking would take will do. A camera that may be anywhere sees much that looks alike,
+    such as the cars and windows of another street: see `doubt_of`.
     """
-    least = config.tracking if nearby else config.relocalization
     matched = dict(known or {})
     open_ids = [i for i in candidates if i not in matched]
     matched.update(zip(open_ids, matcher.match_many(features, [current.keyframes[i].features for i in open_ids]), strict=True))
@@ -35,17 +34,29 @@ def relocalize(
         return None
     reference_id = max(matched, key=lambda i: (len(matched[i]), i))
     found = localize(current, features, reference_id, matched, None, config)
-    if isinstance(found, str) or found.inliers < least.min_inliers:
+    if isinstance(found, str) or found.inliers < config.tracking.min_inliers:
         return None
     reference_id = best_reference(current, found.landmark_ids, list(matched))
-    if not nearby:
-        visible = should_be_seen(current, [reference_id], found.camera_from_world, config.tracking)
-        agreeing = int(np.isin(visible, found.landmark_ids).sum())
-        if agreeing < config.relocalization.min_visible_share * len(visible):
-            told = "the frame at %.3f s looks like keyframe %d: %d of its landmarks agree with one pose, %d should be seen from there"
-            logger.info(told, features.stamp_ns / 1e9, reference_id, agreeing, len(visible))
-            return None
+    doubt = "" if nearby else doubt_of(current, found, reference_id, config)
+    if doubt:
+        logger.info("the frame at %.3f s looks like keyframe %d: %s", features.stamp_ns / 1e9, reference_id, doubt)
+        return None
     return found, reference_id, matched[reference_id]
+
+
+def doubt_of(current: Map, found: Localization, reference_id: int, config: ThegraConfig) -> str:
+    """Why a pose of a camera that may be anywhere is not believed, by the keyframe that shares most with it; empty if it is."""
+    settings = config.relocalization
+    agreeing, visible = evidence(current, found, reference_id, config)
+    if found.inliers < settings.min_inliers:
+        return f"{found.inliers} landmarks agree with one pose"
+    return f"{agreeing} landmarks agree with one pose, {visible} should be seen from there" if agreeing < settings.min_visible_share * visible else ""
+
+
+def evidence(current: Map, found: Localization, reference_id: int, config: ThegraConfig) -> tuple[int, int]:
+    """How many of a keyframe's landmarks a frame sees, and how many it should see from its pose."""
+    visible = should_be_seen(current, [reference_id], found.camera_from_world, config.tracking)
+    return int(np.isin(visible, found.landmark_ids).sum()), len(visible)
 
 
 def last_keyframes(current: Map, reference_id: int, count: int) -> list[int]:

@@ -34,7 +34,7 @@ from thegra_core.tracking.followed import TrackLandmarks, localize_followed
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
 from thegra_core.tracking.motion import MotionModel
-from thegra_core.tracking.relocalizer import last_keyframes, nearest_in_time, relocalize, similar_keyframes
+from thegra_core.tracking.relocalizer import doubt_of, evidence, last_keyframes, nearest_in_time, relocalize, similar_keyframes
 from thegra_core.tracking.tracker import FrameView, Localization, best_reference, localize
 
 FloatArray = NDArray[np.float64]
@@ -178,6 +178,8 @@ class TrackingStage:
         if matches is None or matches.reference_stamp_ns != place.reference.stamp_ns:
             matches = self._matcher.match(features, place.reference)
         found = localize(place.map, features, place.reference_id, {place.reference_id: matches}, place.predict(features.stamp_ns), self._config)
+        if place.lost_frames and not isinstance(found, str):
+            found = doubt_of(place.map, found, place.reference_id, self._config) or found
         if isinstance(found, str):
             return self._recover(place, features, matches, found, turned)
         return self._accept(place, features, found, matches)
@@ -340,8 +342,8 @@ class TrackingStage:
 
     def _accept(self, place: _Place, features: Features, found: Localization, matches: Matches) -> TrackingOutput:
         if place.lost_frames:
-            told = "found again at %.3f s in map %d after %d frames: %d landmarks agree, %d should be seen from there"
-            logger.info(told, features.stamp_ns / 1e9, place.map.map_id, place.lost_frames, found.inliers, len(found.visible_ids))
+            told = "found again at %.3f s in map %d after %d frames: %d landmarks of the most similar keyframe agree, %d should be seen from there"
+            logger.info(told, features.stamp_ns / 1e9, place.map.map_id, place.lost_frames, *evidence(place.map, found, place.reference_id, self._config))
             place.lost_frames = 0
             self.relocalizations += 1
             place.motion.reset()
