@@ -104,14 +104,12 @@ def _seen_again(placed: Sequence[FrameRecord], plan: Joining, joined: Joined) ->
     wanted, distances = 0, []
     for first, later in pairs:
         extent = _extent([f for (part, _), f in sights.items() if part == first])
-        for (part, source), record in sights.items():
-            again = sights.get((later, source))
-            if part != first:
-                continue
+        for source in joined.source[joined.part == later].tolist():
             wanted += 1
-            if again is not None and again.map_id == record.map_id:
-                distances.append(float(np.linalg.norm(_position(record) - _position(again))) / max(extent, 1e-9))
-    return round(100.0 * len(distances) / wanted, 1) if wanted else 0.0, round(float(np.median(distances)), 4) if distances else None
+            before, again = sights.get((first, source)), sights.get((later, source))
+            if before is not None and again is not None and before.map_id == again.map_id:
+                distances.append(float(np.linalg.norm(_position(before) - _position(again))) / max(extent, 1e-9))
+    return round(100.0 * len(distances) / wanted, 1), round(float(np.median(distances)), 4) if distances else None
 
 
 def _verdict(result: Mapping[str, Any]) -> str:
