@@ -34,6 +34,7 @@ def slam(
     only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Of the suite only this sequence; repeatable.")] = None,
     profile: Annotated[list[str] | None, typer.Option(help="paper, quality, fast or realtime; repeatable. Default: quality; with --suite all.")] = None,
     runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time; times are then those of a shared machine.")] = 1,
     cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there; their time is then missing from s/frame.")] = None,
     max_frames: Annotated[list[str] | None, typer.Option("--max-frames", metavar="NAME=N", help="Use the first N frames of the recording of that name; repeatable.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the tables and every run's results. Default: runs/benchmark_TIME.")] = None,
@@ -65,6 +66,7 @@ def slam(
         cache=cache,
         max_frames=_limits(max_frames or []),
         assignments=tuple(set_ or ()),
+        workers=workers,
     )
     others = read_peers(peers) if peers is not None else None
     total = len(logic.planned_runs(plan))
