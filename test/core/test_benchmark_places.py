@@ -18,7 +18,7 @@ from thegra_core.evaluation.benchmark.settings import Settings
 from thegra_core.messages import Features, Frame
 from thegra_core.sources.joined import Clip
 
-PATH = loop(110)[:24]
+PATH = loop(110)[:20]
 ROOM, OTHER = room(1500), room(1500, seed=7)
 CONFIG = load_config("quality", overrides={"preprocessing.filters": "[]", "loop.rotations": "[]"})
 
@@ -57,17 +57,17 @@ def test_what_is_joined() -> None:
 
 def test_scenes_that_differ_are_right(tmp_path: Path) -> None:
     clips, settings = made(OTHER)
-    content = places.benchmark(clips, places.Plan(trials=4, shown=8), settings, tmp_path, lambda _: None)
+    content = places.benchmark(clips, places.Plan(trials=3, shown=5), settings, tmp_path, lambda _: None)
     assert places.wrong(content) == []
     pair, back, _, between, _ = content["joined"]
     assert (pair["maps"], pair["false_poses"], pair["found_again_pct"], pair["verdict"]) == (2, 0, None, "right")
     assert (back["maps"], back["losses"], back["verdict"]) == (1, 0, "right") and back["found_again_pct"] > 90 and back["apart"] < 0.02
     assert between["verdict"] == "right" and between["found_again_pct"] > 50
     first, _ = content["kidnapped"]
-    assert (first["map"], first["found"], first["elsewhere"], first["lost"], first["claims"]) == ("one", 4, 0, 0, {"two": []})
+    assert (first["map"], first["found"], first["elsewhere"], first["lost"], first["claims"]) == ("one", 3, 0, 0, {"two": []})
     assert json.loads((tmp_path / "results.json").read_text(encoding="utf-8")) == content
     written = (tmp_path / "results.md").read_text(encoding="utf-8")
-    assert "| one + two back |" not in written and "| one + one back |" in written and "| one | 4 / 4 | 0 |" in written and "Wrong" not in written
+    assert "| one + two back |" not in written and "| one + one back |" in written and "| one | 3 / 3 | 0 |" in written and "Wrong" not in written
 
 
 def test_a_scene_that_is_another_one_is_told(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_a_scene_that_is_another_one_is_told(tmp_path: Path) -> None:
     clips, settings = made(ROOM)
     content = places.benchmark(clips, places.Plan(("pairs", "kidnapped"), trials=2, shown=5), settings, tmp_path, lambda _: None)
     (pair,) = content["joined"]
-    assert pair["false_poses"] >= 20 and pair["verdict"] == "wrong: two scenes in one map"
+    assert pair["false_poses"] >= 16 and pair["verdict"] == "wrong: two scenes in one map"
     claims = content["kidnapped"][0]["claims"]["two"]
     assert len(claims) >= 3 and all(0 < agree <= visible for agree, visible in claims)
     assert [line.rpartition(":")[0] for line in places.wrong(content)] == ["one + two: wrong", "two in the map of one", "one in the map of two"]
@@ -96,7 +96,7 @@ def test_a_place_that_is_not_found_again_is_told() -> None:
 def test_a_kidnapped_camera_that_is_found_elsewhere_is_told(tmp_path: Path) -> None:
     clips, settings = made(OTHER)
     place = kidnapping.known_place(clips["one"], settings, tmp_path / "one.map")
-    assert place is not None and 8 <= len(place.unseen()) <= 12
+    assert place is not None and 6 <= len(place.unseen()) <= 10
     assert kidnapping.kidnap(place, 3, settings) == [True] * 3
     moved = kidnapping.KnownPlace(place.clip, place.file, {i: position + 1.0 for i, position in place.positions.items()})
     assert kidnapping.kidnap(moved, 3, settings) == [False] * 3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from thegra_core.errors import ConfigError
 from thegra_core.evaluation.benchmark import joining, kidnapping
+from thegra_core.evaluation.benchmark.machine import described, machine
 from thegra_core.evaluation.benchmark.settings import Settings
 from thegra_core.evaluation.benchmark.slam import Plan as Folder
 from thegra_core.evaluation.benchmark.slam import write_report
@@ -47,7 +47,7 @@ def benchmark(clips: Mapping[str, Clip], plan: Plan, settings: Settings, out: Pa
         InputError: If a result cannot be written.
     """
     content: dict[str, Any] = {
-        "version": VERSION, "platform": platform.platform(), "profile": settings.config.profile, "assignments": list(plan.assignments), "gap_s": plan.gap_s,
+        "version": VERSION, "machine": machine(), "profile": settings.config.profile, "assignments": list(plan.assignments), "gap_s": plan.gap_s,
         "frames": {name: len(clip.frames) for name, clip in clips.items()}, "joined": [], "kidnapped": [],
     }  # fmt: skip
     for which in joining.planned(list(clips), plan.checks):
@@ -79,7 +79,7 @@ def markdown(content: Mapping[str, Any]) -> str:
     """GitHub tables, and what their columns mean."""
     settings = f", with {', '.join(content['assignments'])}" if content["assignments"] else ""
     frames = sorted(set(content["frames"].values()))
-    told = [f"Profile {content['profile']}{settings}; {frames[0]} to {frames[-1]} frames a recording. Thegra {content['version']}, {content['platform']}."]
+    told = [f"Profile {content['profile']}{settings}; {frames[0]} to {frames[-1]} frames a recording. Thegra {content['version']}, {described(content['machine'])}."]
     if content["joined"]:
         gap = f" {content['gap_s']:g} s without a frame between clips." if content["gap_s"] else ""
         explained = (
