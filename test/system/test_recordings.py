@@ -132,6 +132,17 @@ def test_simulated_scenes_are_tracked(tmp_path: Path, scene: Any, shutter: Any, 
     assert reached["in_closure"] == 0, "no pose is claimed while the shutter is closed"
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(PATIENCE_S)
+def test_a_long_corridor_closes_its_loop(tmp_path: Path) -> None:
+    """Once round and on, 71 m: what has drifted is set right where the way began."""
+    options = SimulationOptions(scene="corridor", duration_s=71.6, rate_hz=5, image_size=(320, 256), seed=210)
+    reached = figures(simulate(options, tmp_path / "corridor", "folder"), tmp_path / "out")
+    assert reached["tracked_pct"] >= 97
+    assert reached["loops"] >= 1
+    assert reached["ate_pct"] <= 0.3
+
+
 def test_same_input_same_bytes(tmp_path: Path) -> None:
     bag = simulate(SimulationOptions(style="aggressive", duration_s=1.5, image_size=(320, 256)), tmp_path / "bag")
     extractor = "orb" if missing_weights("fast") else "xfeat"
