@@ -35,6 +35,11 @@ class CameraInput:
             node.listen(CameraInfo, "camera_info", SENSOR, self._on_info)
         node.every(COMPLAINT_PERIOD_S, self._complain)
 
+    @property
+    def described(self) -> str:
+        """The camera in words, for the diagnostics."""
+        return described(self.camera)
+
     def _on_info(self, info: CameraInfo) -> None:
         seen = (tuple(info.k), tuple(info.d), info.distortion_model, info.width, info.height)
         if seen == self._seen:
@@ -48,7 +53,7 @@ class CameraInput:
         before, self.camera = self.camera, camera
         if camera is None:
             return
-        what = f"{camera.image_size[0]}x{camera.image_size[1]}, {camera.model.value}, focal length {camera.focal:.1f} px"
+        what = described(camera)
         if before is not None:
             self._on_change(f"{self._topic} changed to {what}")
         else:
@@ -57,3 +62,8 @@ class CameraInput:
     def _complain(self) -> None:
         if self._health.camera_trouble and self._node.active:
             self._node.get_logger().warning(self._health.camera_trouble)
+
+
+def described(camera: CameraModel | None) -> str:
+    """A camera in words."""
+    return "unknown" if camera is None else f"{camera.image_size[0]}x{camera.image_size[1]}, {camera.model.value}, focal length {camera.focal:.1f} px"

@@ -1,18 +1,12 @@
-"""The system as a node uses it: frames in, results out, in a process of its own or in this one. No ROS here.
-
-Bundle adjustment holds Python's global lock while it solves; in the node's process it would starve the callbacks that receive images.
-"""
+"""The system as a node uses it: frames in, results out, in a process of its own or in this one. No ROS here."""
 
 from __future__ import annotations
 
 import logging
 import multiprocessing
-import signal
-import threading
 import time
 import traceback
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -20,7 +14,8 @@ from thegra_core.config import ThegraConfig
 from thegra_core.errors import InputError, ThegraError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame, MapSummary, Snapshot, TrackingResult
-from thegra_core.process import keep_freed_memory, set_threads
+from thegra_core.process import set_threads
+from thegra_ros.beside import Beside, EngineError
 from thegra_ros.image_slot import make_slot, put, take
 
 if TYPE_CHECKING:
@@ -28,12 +23,6 @@ if TYPE_CHECKING:
     from thegra_core.slam import Slam
 
 _log = logging.getLogger(__name__)
-LAST_WORDS_S = 1.0
-"""How long the process may take to end by itself when it is told to."""
-
-
-class EngineError(Exception):
-    """The system could not work on a frame; the next frame begins a new map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +83,7 @@ class Engine(Protocol):
         """Work on a frame, waiting for the result.
 
         Raises:
-            EngineError: If it failed.
+            EngineError: If it failed; the next frame begins a new map.
             ThegraError: If the map of `home` cannot be used.
         """
 
@@ -175,6 +164,8 @@ class LocalEngine:
             self.start()
         made = Slam(camera, self._config, *(self._networks or ()), keep_records=False, beside=self._beside, solver=ProcessSolver())
         try:
+            if self._beside:
+                made.warm_up()  # a map that is found before mapping's process is there would be lost again
             if home is not None:
                 made.load_map(home)
         except BaseException:
@@ -188,104 +179,40 @@ class LocalEngine:
 
 
 class ProcessEngine:
-    """The system in a process of its own, which ends with this one."""
+    """The system in a process of its own."""
 
     def __init__(self, config: ThegraConfig) -> None:
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
         self._slot = make_slot(context)
-        self._process = context.Process(target=serve, args=(theirs, config, self._slot), daemon=True, name="thegra engine")
-        self._theirs = theirs
-        self._sending = threading.Lock()
+        self._beside = Beside("thegra engine", SlotEngine, config, self._slot, context=context)
 
     def start(self) -> None:
-        self._process.start()
-        self._theirs.close()
-        answer = self._receive()
-        if isinstance(answer, ThegraError):
-            raise answer
+        self._beside.start()
+        self._beside.call("start")
 
     def process(self, job: Job) -> Done:
-        answer = self._ask(replace(job, frame=put(self._slot, job.frame)))
-        assert isinstance(answer, Done)
-        return answer
+        done = self._beside.call("process", replace(job, frame=put(self._slot, job.frame)))
+        assert isinstance(done, Done)
+        return done
 
     def obey(self, order: Order) -> str:
-        return str(self._ask(order))
+        return str(self._beside.call("obey", order))
 
     def stop(self) -> None:
-        if self._process.pid is None:
-            return
-        try:
-            with self._sending:
-                self._connection.send(None)
-        except (OSError, ValueError):  # it has gone already
-            _log.debug("the engine's process has gone already")
-        self._process.join(LAST_WORDS_S)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
-
-    @property
-    def alive(self) -> bool:
-        return self._process.is_alive()
-
-    def _ask(self, what: Job | Order) -> object:
-        try:
-            with self._sending:
-                self._connection.send(what)
-        except OSError as error:
-            raise EngineError(self._epitaph()) from error
-        answer = self._receive()
-        if isinstance(answer, EngineError | ThegraError):
-            raise answer
-        return answer
-
-    def _receive(self) -> object:
-        try:
-            return self._connection.recv()
-        except (EOFError, OSError) as error:
-            raise EngineError(self._epitaph()) from error
-
-    def _epitaph(self) -> str:
-        self._process.join(LAST_WORDS_S)
-        code = self._process.exitcode
-        return f"the process of the SLAM system has ended with code {code}" + (" (killed; out of memory?)" if code == -signal.SIGKILL else "")
+        self._beside.stop()
 
 
-def serve(connection: Connection, config: ThegraConfig, slot: Any) -> None:
-    """Work on jobs and orders until told to end or the other end is gone; runs in the engine's process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to the whole group; the node tells when to end
-    logging.basicConfig(level=logging.INFO, format="[thegra engine] %(levelname)s %(message)s")
-    keep_freed_memory()
-    engine = LocalEngine(config, beside=True)
-    begin = time.perf_counter()
-    try:
-        engine.start()
-    except ThegraError as error:
-        connection.send(error)
-        return
-    connection.send("ready")
-    _log.info("networks loaded in %.1f s", time.perf_counter() - begin)
-    try:
-        _answer(connection, engine, slot)
-    finally:
-        engine.stop()
+class SlotEngine(LocalEngine):
+    """What runs in that process: the images of its jobs are in the slot, and mapping has a process of its own."""
 
+    def __init__(self, config: ThegraConfig, slot: Any) -> None:
+        super().__init__(config, beside=True)
+        self._slot = slot
 
-def _answer(connection: Connection, engine: LocalEngine, slot: Any) -> None:
-    while True:
-        try:
-            asked = connection.recv()
-        except (EOFError, OSError):
-            return
-        if asked is None:
-            return
-        try:
-            answer: object = engine.process(replace(asked, frame=take(slot, asked.frame))) if isinstance(asked, Job) else engine.obey(asked)
-        except (EngineError, ThegraError) as error:
-            answer = error
-        try:
-            connection.send(answer)
-        except OSError:
-            return
+    def start(self) -> None:
+        begin = time.perf_counter()
+        super().start()
+        _log.info("networks loaded in %.1f s", time.perf_counter() - begin)
+
+    def process(self, job: Job) -> Done:
+        return super().process(replace(job, frame=take(self._slot, job.frame)))

@@ -27,3 +27,4 @@ class NodeConfig(Section):
     scale: float = Field(1.0, gt=0, description="metres of one map unit; one camera does not see size")
     path_length: int = Field(1000, ge=2, description="poses of path at the most; then every second one goes")
     map_period_s: float = Field(1.0, ge=0, description="seconds between two map_points and keyframe_path at the least")
+    diagnostics_period_s: float = Field(1.0, gt=0, description="seconds between two words on /diagnostics at the most; a change is told at once")

@@ -105,7 +105,7 @@ class TrackingNode(StageNode):
         stage = self._stage
         return {
             "state": self.health.state.value, "lost parts": self._joiner.lost + self._assembler.broken, "map": stage.map_id if stage is not None else -1,
-            "map grows": "no" if self._localizing else "yes",
+            "map grows": "no" if self._localizing else "yes", "camera": self._camera.described,
         }  # fmt: skip
 
     # ---- the working thread ---------------------------------------------------------------------------------------------------------
