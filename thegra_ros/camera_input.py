@@ -10,11 +10,10 @@ from sensor_msgs.msg import CameraInfo
 from thegra_core.errors import CalibrationError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.sources.calibration import camera_from_info, load_camera
-from thegra_ros.diagnostics import Health
+from thegra_ros.diagnostics import COMPLAINT_PERIOD_S, Health
+from thegra_ros.elsewhere import advice
 from thegra_ros.lifecycle import ManagedNode
 from thegra_ros.qos import SENSOR
-
-COMPLAINT_PERIOD_S = 5.0
 
 
 class CameraInput:
@@ -60,8 +59,10 @@ class CameraInput:
             self._node.get_logger().info(f"camera {what}, from {self._topic}")
 
     def _complain(self) -> None:
-        if self._health.camera_trouble and self._node.active:
-            self._node.get_logger().warning(self._health.camera_trouble)
+        if not self._health.camera_trouble or not self._node.active:
+            return
+        where = f" ({advice(self._node, CameraInfo, self._topic, 'remap camera_info')})" if self._seen is None else ""
+        self._node.get_logger().warning(self._health.camera_trouble + where)
 
 
 def described(camera: CameraModel | None) -> str:

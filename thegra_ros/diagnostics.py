@@ -31,6 +31,8 @@ _WORDS = {
     TrackingState.RELOCALIZING: "looking for the place after a closure",
     TrackingState.LOST: "lost",
 }
+COMPLAINT_PERIOD_S = 5.0
+"""What keeps a node from working is logged so often."""
 SILENCE_S = 2.0
 """Without an image received or worked on for so long nothing is OK."""
 

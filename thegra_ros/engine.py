@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from thegra_core.config import ThegraConfig
-from thegra_core.errors import InputError, ThegraError
+from thegra_core.errors import InputError, MappingError, ThegraError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame, MapSummary, Snapshot, TrackingResult
 from thegra_core.process import set_threads
@@ -20,6 +20,7 @@ from thegra_ros.image_slot import make_slot, put, take
 
 if TYPE_CHECKING:
     from thegra_core.features.protocols import Extractor, Matcher
+    from thegra_core.mapping.process import MappingProcess
     from thegra_core.slam import Slam
 
 _log = logging.getLogger(__name__)
@@ -105,22 +106,29 @@ class LocalEngine:
     def __init__(self, config: ThegraConfig, beside: bool = False) -> None:
         self._config = config
         self._beside = beside
-        self._networks: tuple[Extractor, Matcher] | None = None
+        self._networks: tuple[Extractor, Matcher | None] | None = None
         self._slam: Slam | None = None
+        self._mapping: MappingProcess | None = None
         self._epoch = -1
 
     def start(self) -> None:
         set_threads(self._config.threads)
         from thegra_core.features.registry import make_extractor, make_matcher
 
-        self._networks = make_extractor(self._config.extractor), make_matcher(self._config.matcher, self._config.extractor)
+        learned = self._config.tracking.match_by != "nearest"
+        self._networks = make_extractor(self._config.extractor), make_matcher(self._config.matcher, self._config.extractor) if learned else None
 
     def process(self, job: Job) -> Done:
-        slam = self._slam_for(job)
         try:
+            slam = self._slam_for(job)
             result = slam.process(job.frame)
             view = slam.snapshot() if job.wants_view else None
             return Done(result, view, slam.current_map() if job.wants_map else None)
+        except MappingError as error:
+            self.stop()
+            raise EngineError(str(error)) from error
+        except ThegraError:
+            raise
         except Exception as error:
             self.stop()
             raise EngineError(traceback.format_exc()) from error
@@ -128,6 +136,9 @@ class LocalEngine:
     def obey(self, order: Order) -> str:
         try:
             return self._save(order.path) if isinstance(order, SaveMap) else self._begin_in(order)
+        except MappingError as error:
+            self.stop()
+            raise EngineError(str(error)) from error
         except ThegraError:
             raise
         except Exception as error:
@@ -135,9 +146,10 @@ class LocalEngine:
             raise EngineError(traceback.format_exc()) from error
 
     def stop(self) -> None:
-        if self._slam is not None:
-            self._slam.close()
-        self._slam = None
+        for ending in (self._slam, self._mapping):
+            if ending is not None:
+                ending.close()
+        self._slam = self._mapping = None
 
     def _save(self, path: Path) -> str:
         if self._slam is None:
@@ -147,24 +159,47 @@ class LocalEngine:
 
     def _begin_in(self, order: BeginIn) -> str:
         self._epoch = order.epoch  # also where it cannot be: the frames to come are then in the map that is there
-        self._replace(self._new(order.camera, order.path), order.epoch)
+        mapping = self._new_mapping(order.camera) if self._beside else None
+        made = self._new(order.camera, order.path, mapping)
+        self.stop()
+        self._slam, self._mapping = made, mapping
         return f"the camera is sought in the map of {order.path}"
 
     def _slam_for(self, job: Job) -> Slam:
         if self._slam is None or job.epoch != self._epoch:
-            self._replace(self._new(job.camera, job.home), job.epoch)
+            self._slam = None
+            self._slam = self._new(job.camera, job.home, self._emptied_mapping(job.camera) if self._beside else None)
+            self._epoch = job.epoch
         self._slam.localization_only = job.localization_only
         return self._slam
 
-    def _new(self, camera: CameraModel, home: Path | None) -> Slam:
+    def _emptied_mapping(self, camera: CameraModel) -> MappingProcess:
+        """Mapping's process without a map: the one that is there, if it still is."""
+        try:
+            if self._mapping is not None:
+                self._mapping.begin(camera)
+                return self._mapping
+        except MappingError as error:
+            _log.warning("mapping is started again: %s", error)
+            self.stop()
+        self._mapping = self._new_mapping(camera)
+        return self._mapping
+
+    def _new_mapping(self, camera: CameraModel) -> MappingProcess:
+        from thegra_core.mapping.process import MappingProcess
+        from thegra_core.slam import make_frame_matcher
+
+        return MappingProcess(camera, self._config, make_frame_matcher)
+
+    def _new(self, camera: CameraModel, home: Path | None, mapping: MappingProcess | None) -> Slam:
         from thegra_core.optimization.solver import ProcessSolver
         from thegra_core.slam import Slam
 
         if self._networks is None:
             self.start()
-        made = Slam(camera, self._config, *(self._networks or ()), keep_records=False, beside=self._beside, solver=ProcessSolver())
+        made = Slam(camera, self._config, *(self._networks or ()), keep_records=False, mapping=mapping, solver=ProcessSolver())
         try:
-            if self._beside:
+            if mapping is not None:
                 made.warm_up()  # a map that is found before mapping's process is there would be lost again
             if home is not None:
                 made.load_map(home)
@@ -172,10 +207,6 @@ class LocalEngine:
             made.close()
             raise
         return made
-
-    def _replace(self, made: Slam, epoch: int) -> None:
-        self.stop()
-        self._slam, self._epoch = made, epoch
 
 
 class ProcessEngine:

@@ -17,7 +17,7 @@ from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_graph import NAMESPACE, Graph, set_parameter
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image
 
 from thegra_core.geometry.camera import CameraModel
 from thegra_ros.codec.stamps import stamp_ns
@@ -189,4 +189,14 @@ def test_ends_that_do_not_fit_are_told(graph: Graph) -> None:
     graph.node.create_publisher(Image, "image_raw", QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
     graph.wait(lambda: "no data between" in node.output, "a word about the misfit")
     assert f"qos_overrides.{NAMESPACE}/image_raw.subscription.reliability" in node.output
+    assert node.end() == 0
+
+
+def test_a_topic_that_brings_nothing_is_told_with_those_that_are_there(graph: Graph) -> None:
+    """The user's first mistake: the camera publishes elsewhere."""
+    graph.node.create_publisher(Image, "/boson/image_raw", 5)
+    graph.node.create_publisher(CameraInfo, "/boson/camera_info", 5)
+    node = graph.start(extra=["-r", "image_raw:=/camera/image_raw", "-r", "camera_info:=/camera/camera_info"])
+    graph.wait(lambda: "nobody publishes /camera/image_raw; Image is on /boson/image_raw" in node.output)
+    graph.wait(lambda: "nobody publishes /camera/camera_info; CameraInfo is on /boson/camera_info" in node.output)
     assert node.end() == 0

@@ -59,7 +59,12 @@ def process_of(node: NodeProcess, what: str) -> int:
     return found
 
 
-def all_gone(graph: Graph, pids: Sequence[int]) -> None:
+def end(graph: Graph, node: NodeProcess, number: int, pids: Sequence[int]) -> None:
+    """End a node by a signal, and see that its processes have ended, too."""
+    if number == signal.SIGKILL:
+        graph.forget(node)
+    else:
+        assert node.end(number) == 0
     graph.wait(lambda: not any(map(runs, pids)), f"the end of {pids}")
 
 
@@ -91,12 +96,8 @@ def test_slam_ends_with_its_processes(graph: Graph, frames, camera, stopped: lis
     assert len(pids) >= 2, "the system's process, and mapping's"
     if endless:
         stop(process_of(node, MAPPING_OF_SLAM), stopped)
-    code = node.end(number)
-    all_gone(graph, pids)
+    end(graph, node, number, pids)
     assert graph.processed() < 2 * len(frames) - 1, "there was work left"
-    assert code == (-signal.SIGKILL if number == signal.SIGKILL else 0)
-    if code:
-        graph.forget(node)
 
 
 class Handed:
@@ -148,12 +149,8 @@ def test_mapping_ends_with_its_process(graph: Graph, frames, camera, stopped: li
     pids = descendants(node.process.pid)
     if endless:
         stop(process_of(node, SPAWNED), stopped)
-    code = node.end(number)
-    all_gone(graph, pids)
+    end(graph, node, number, pids)
     assert kinds().count("update") < len(records), "there was work left"
-    assert code == (-signal.SIGKILL if number == signal.SIGKILL else 0)
-    if code:
-        graph.forget(node)
 
 
 COMPUTES = """

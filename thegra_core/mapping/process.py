@@ -66,7 +66,18 @@ class MappingProcess:
         self._writer.start()
         self._updates: list[MapUpdate] = []
         self._submitted: deque[Future[Any]] = deque()
-        self._tell("begin", camera, config, make_matcher)
+        self._tell("equip", config, make_matcher)
+        self._tell("begin", camera)
+
+    def begin(self, camera: CameraModel) -> None:
+        """Forget all maps, for another stream or camera: a new process would load everything again. Waits for what is in work.
+
+        Raises:
+            MappingError: If mapping has ended with an error.
+        """
+        self._tell("begin", camera)
+        self._ask("usage")
+        self._updates.clear()
 
     def initialize(self, initial: InitialMap) -> None:
         """See `MappingService.initialize`."""
@@ -195,15 +206,22 @@ class MappingProcess:
 def serve(connection: Connection) -> None:
     """Do what comes over the connection, in order, until it ends."""
     mapping: InlineMapping | None = None
+    config: ThegraConfig
+    matcher: Matcher
     while True:
         try:
             name, arguments = connection.recv()
         except (EOFError, OSError):
             return
         try:
+            if name == "equip":
+                config, make_matcher = arguments
+                matcher = make_matcher(config)
+                continue
             if name == "begin":
-                camera, config, make_matcher = arguments
-                mapping = InlineMapping(Mapper(camera, config, make_matcher(config), ProcessSolver()))
+                for known in mapping.maps() if mapping is not None else ():  # also what is solved for them elsewhere
+                    mapping.drop(known.map_id)
+                mapping = InlineMapping(Mapper(*arguments, config, matcher, ProcessSolver()))
                 continue
             assert mapping is not None
             for answer in _do(mapping, name, arguments):
