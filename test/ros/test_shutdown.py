@@ -100,31 +100,31 @@ def test_slam_ends_with_its_processes(graph: Graph, frames, camera, stopped: lis
     assert graph.processed() < 2 * len(frames) - 1, "there was work left"
 
 
-class Handed:
+@pytest.fixture(scope="module")
+def records(frames, camera) -> list[InitialMap | Keyframe]:
     """What tracking hands to mapping, from an offline run."""
+    slam = Slam(camera, load_config("fast", overrides={**OFFLINE, "keyframe.translation_ratio": 0.001}))
+    kept: list[InitialMap | Keyframe] = []
 
-    def __init__(self, frames, camera) -> None:
-        slam = Slam(camera, load_config("fast", overrides={**OFFLINE, "keyframe.translation_ratio": 0.001}))
-        self.records: list[InitialMap | Keyframe] = []
-        for name in ("initialize", "insert"):
-            setattr(slam._mapping, name, self._keeping(getattr(slam._mapping, name)))
-        for frame in frames:
-            slam.process(frame)
-        assert isinstance(self.records[0], InitialMap) and len(self.records) > 10
-
-    def _keeping(self, hand_over: Any) -> Any:
+    def keeping(hand_over: Any) -> Any:
         def keep(record: InitialMap | Keyframe) -> None:
-            self.records.append(record)
+            kept.append(record)
             hand_over(record)
 
         return keep
+
+    for name in ("initialize", "insert"):
+        setattr(slam._mapping, name, keeping(getattr(slam._mapping, name)))
+    for frame in frames:
+        slam.process(frame)
+    assert isinstance(kept[0], InitialMap) and len(kept) > 10
+    return kept
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
 @pytest.mark.parametrize("endless", [False, True], ids=["at work", "with work that does not end"])
-def test_mapping_ends_with_its_process(graph: Graph, frames, camera, stopped: list[int], number: int, endless: bool) -> None:
-    records = Handed(frames, camera).records
+def test_mapping_ends_with_its_process(graph: Graph, records: list[InitialMap | Keyframe], camera, stopped: list[int], number: int, endless: bool) -> None:
     node = graph.start("thegra_ros.nodes.mapping", OWN_PROCESSES)
     answers = graph.listen(PointCloud2, "map_update", LOSSLESS)
     keyframes = graph.node.create_publisher(PointCloud2, "keyframe", LOSSLESS)
