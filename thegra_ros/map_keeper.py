@@ -60,9 +60,9 @@ class MapKeeper:
             ThegraError: If something the user can put right is missing.
         """
         set_threads(self._config.threads)
-        from thegra_core.features.registry import make_matcher
+        from thegra_core.features.registry import make_frame_matcher
 
-        self._matcher = make_matcher(self._config.matcher, self._config.extractor)
+        self._matcher = make_frame_matcher(self._config)
 
     def begin(self, camera: CameraModel, home: Path | None) -> Kept:
         """Begin anew: with the map of a file, or empty.

@@ -43,7 +43,7 @@ class Stages:
         graph.send_camera(camera, "tracking", "mapping")
         # a stream finds its listeners; what is sent before is lost
         self.send_until(noisy_copies(first, first.stamp_ns + 100 * 10**9), lambda: self.value("tracking", "processed") > 0, "a frame that reaches tracking")
-        self.begin_again(next(noisy_copies(first, first.stamp_ns - 100_000_000)))
+        self.begin_again(first)
 
     def works(self, name: str) -> bool:
         return any(m.status[0].name.endswith(name) and m.status[0].message != "the node is not active" for m in self.graph.received["/diagnostics"])
@@ -57,10 +57,10 @@ class Stages:
             self.graph.send([frame])
             self.graph.wait(lambda n=done: self.value("tracking", "processed") > n, f"frame {frame.index}")
 
-    def begin_again(self, frame: Frame) -> None:
-        """Send an image of the past: with the next one, which is of the past, too, all begins anew."""
+    def begin_again(self, first: Frame) -> None:
+        """Send an image of before the first: with that, the second one of the past, all begins anew."""
         came = self.value("preprocessing", "images")
-        self.graph.send([frame])
+        self.graph.send([next(noisy_copies(first, first.stamp_ns - 100_000_000))])
         self.graph.wait(lambda: self.value("preprocessing", "images") > came, "an image of the past")
 
     def send_until(self, frames: Iterator[Frame], reached: Callable[[], bool], what: str) -> None:
