@@ -61,8 +61,10 @@ class CameraInput:
     def _complain(self) -> None:
         if not self._health.camera_trouble or not self._node.active:
             return
-        where = f" ({advice(self._node, CameraInfo, self._topic, 'remap camera_info')})" if self._seen is None else ""
-        self._node.get_logger().warning(self._health.camera_trouble + where)
+        text = self._health.camera_trouble
+        if self._seen is None:
+            text = f"no camera_info yet: {advice(self._node, CameraInfo, self._topic, 'remap camera_info')}. Or give a calibration: thegra live --camera FILE, parameter camera_file"
+        self._node.get_logger().warning(text)
 
 
 def described(camera: CameraModel | None) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from rclpy.node import Node
 
-OWN_OUTPUTS = ("image_preprocessed", "image_tracks")
+OUTPUTS = ("image_preprocessed", "image_tracks")
+"""Images that Thegra itself publishes."""
 
 
 def advice(node: Node, kind: type, topic: str, remap: str) -> str:
@@ -18,8 +19,8 @@ def advice(node: Node, kind: type, topic: str, remap: str) -> str:
     if node.count_publishers(topic):
         return f"something publishes {topic}, but nothing has come"
     wanted = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
-    own = {node.resolve_topic_name(name) for name in OWN_OUTPUTS}
-    others = sorted(name for name, kinds in node.get_topic_names_and_types() if wanted in kinds and name not in own and node.count_publishers(name))
+    there = (name for name, kinds in node.get_topic_names_and_types() if wanted in kinds and name.rpartition("/")[2] not in OUTPUTS)
+    others = sorted(name for name in there if node.count_publishers(name))
     if others:
         return f"nobody publishes {topic}; {kind.__name__} is on {', '.join(others)}: {remap}"
     return f"nobody publishes {topic}, nor {kind.__name__} on any other topic: is the driver running, with the same ROS_DOMAIN_ID?"

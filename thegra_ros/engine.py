@@ -186,8 +186,8 @@ class LocalEngine:
         return self._mapping
 
     def _new_mapping(self, camera: CameraModel) -> MappingProcess:
+        from thegra_core.features.registry import make_frame_matcher
         from thegra_core.mapping.process import MappingProcess
-        from thegra_core.slam import make_frame_matcher
 
         return MappingProcess(camera, self._config, make_frame_matcher)
 

@@ -27,6 +27,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame
+from thegra_ros.benchmark.processes import descendants
 from thegra_ros.camera_input import described
 from thegra_ros.codec.images import camera_info_message, image_message
 from thegra_ros.codec.stamps import header, stamp_ns
@@ -222,6 +223,11 @@ class Graph:
         self._executor.shutdown()
         self.node.destroy_node()
         self._context.shutdown()
+
+
+def children(pid: int) -> list[int]:
+    """Processes that a node has started for the system, or for its map."""
+    return [child for child in descendants(pid) if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
 
 
 def _value(status: DiagnosticStatus, key: str) -> str:

@@ -9,14 +9,13 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ro
 import os
 import signal
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_graph import NAMESPACE, Graph, set_parameter
+from ros_graph import NAMESPACE, Graph, children, set_parameter
 from sensor_msgs.msg import CameraInfo, Image
 
 from thegra_core.geometry.camera import CameraModel
@@ -168,19 +167,6 @@ def test_the_engine_is_started_again_when_it_dies(graph: Graph, frames, camera) 
         graph.wait(lambda n=done: graph.processed() > n, "the frame")
     graph.wait(lambda: len(graph.received["pose"]) > before, "poses of a new map")
     assert node.end() == 0
-
-
-def children(pid: int) -> list[int]:
-    """Processes whose parent this is and that run the engine."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((folder / "stat").read_text().rsplit(")", 1)[1].split()[1])
-            if parent == pid and "spawn_main" in (folder / "cmdline").read_text():
-                found.append(int(folder.name))
-        except (OSError, ValueError):  # it has ended
-            continue
-    return found
 
 
 def test_ends_that_do_not_fit_are_told(graph: Graph) -> None:

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ros_graph import OFFLINE, Graph, NodeProcess
+from ros_graph import OFFLINE, Graph, NodeProcess, children
 from sensor_msgs.msg import PointCloud2
 
 from thegra_core.config import load_config
@@ -53,12 +53,6 @@ def stop(pid: int, stopped: list[int]) -> None:
     os.kill(pid, signal.SIGSTOP)
 
 
-def process_of(node: NodeProcess, what: str) -> int:
-    """The one that a node has for mapping, or for all."""
-    (found,) = (pid for pid in descendants(node.process.pid) if what in Path(f"/proc/{pid}/cmdline").read_text())
-    return found
-
-
 def end(graph: Graph, node: NodeProcess, number: int, pids: Sequence[int]) -> None:
     """End a node by a signal, and see that its processes have ended, too."""
     if number == signal.SIGKILL:
@@ -69,7 +63,6 @@ def end(graph: Graph, node: NodeProcess, number: int, pids: Sequence[int]) -> No
 
 
 MAPPING_OF_SLAM = "thegra_core.mapping.process"
-SPAWNED = "spawn_main"
 
 
 def slam_at_work(graph: Graph, frames, camera) -> NodeProcess:
@@ -95,7 +88,8 @@ def test_slam_ends_with_its_processes(graph: Graph, frames, camera, stopped: lis
     pids = descendants(node.process.pid)
     assert len(pids) >= 2, "the system's process, and mapping's"
     if endless:
-        stop(process_of(node, MAPPING_OF_SLAM), stopped)
+        (mapping,) = (pid for pid in pids if MAPPING_OF_SLAM in Path(f"/proc/{pid}/cmdline").read_text())
+        stop(mapping, stopped)
     end(graph, node, number, pids)
     assert graph.processed() < 2 * len(frames) - 1, "there was work left"
 
@@ -148,7 +142,7 @@ def test_mapping_ends_with_its_process(graph: Graph, records: list[InitialMap | 
     graph.wait(lambda: "update" in kinds(), "the first answer")
     pids = descendants(node.process.pid)
     if endless:
-        stop(process_of(node, SPAWNED), stopped)
+        stop(*children(node.process.pid), stopped)
     end(graph, node, number, pids)
     assert kinds().count("update") < len(records), "there was work left"
 
