@@ -219,9 +219,11 @@ def serve(connection: Connection) -> None:
                 matcher = make_matcher(config)
                 continue
             if name == "begin":
-                for known in mapping.maps() if mapping is not None else ():  # also what is solved for them elsewhere
-                    mapping.drop(known.map_id)
-                mapping = InlineMapping(Mapper(*arguments, config, matcher, ProcessSolver()))
+                if mapping is not None:
+                    for known in mapping.maps():  # also what is solved for them elsewhere
+                        mapping.drop(known.map_id)
+                (camera,) = arguments
+                mapping = InlineMapping(Mapper(camera, config, matcher, ProcessSolver()))
                 continue
             assert mapping is not None
             for answer in _do(mapping, name, arguments):
