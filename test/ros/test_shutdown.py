@@ -66,17 +66,13 @@ MAPPING_OF_SLAM = "thegra_core.mapping.process"
 
 
 def slam_at_work(graph: Graph, frames, camera) -> NodeProcess:
-    """The node with a map, and with more images than it has worked on."""
+    """The node with more images than it has worked on."""
     node = graph.start(parameters=OWN_PROCESSES)
     graph.wait_for_listener()
     graph.send_camera(camera)
-    to_and_fro = [replace(frame, stamp_ns=frames[0].stamp_ns + 10**8 * count) for count, frame in enumerate([*frames, *frames[-2::-1]])]
-    coming = iter(to_and_fro)
-    while not graph.received["pose"]:  # no faster than the first map is solved beside them
-        done = graph.processed()
-        graph.send([next(coming)])
-        graph.wait(lambda n=done: graph.processed() > n, "the frame")
-    graph.send(list(coming))
+    to_and_fro = [*frames, *frames[-2::-1]]
+    graph.send([replace(frame, stamp_ns=frames[0].stamp_ns + 10**8 * count) for count, frame in enumerate(to_and_fro)])
+    graph.wait(lambda: graph.processed() >= 10)
     return node
 
 
