@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -19,10 +18,10 @@ import numpy as np
 
 from thegra_core.config import load_config, parse_assignments
 from thegra_core.errors import InputError
+from thegra_core.evaluation.benchmark.machine import machine
 from thegra_core.evaluation.benchmark.peers import best_peer, median_or_none
 from thegra_core.evaluation.scores import read_intervals, read_stamps
 from thegra_core.evaluation.tasks import RAN, run_process
-from thegra_core.features.device import accelerator_name
 from thegra_core.messages import FloatArray
 from thegra_core.outputs.files import write_atomic
 from thegra_core.outputs.scoring import MIN_COVERAGE_PCT, score_trajectory, spread_of, within
@@ -251,12 +250,7 @@ def report(plan: Plan, results: Sequence[RunResult], peers: Mapping[str, Any] | 
         groups.setdefault((result.run.name, result.run.profile), []).append(result)
     return {
         "version": VERSION,
-        "machine": {
-            "platform": platform.platform(),
-            "python": platform.python_version(),
-            "processors": os.cpu_count(),
-            "accelerator": accelerator_name(),
-        },
+        "machine": machine(),
         "runs": plan.runs,
         "workers": plan.workers,
         "assignments": list(plan.assignments),
