@@ -88,6 +88,7 @@ class Slam:
         extractor, matcher: Instead of those configured.
         keep_records: Remember every frame for `finish`. A live stream has no end and needs only the last one.
         beside: Map in a process of its own, with the matcher configured: `process` never waits for it, and what becomes of a run depends on the machine.
+        mapping: Maps instead of what `beside` says; without a map, and of the same camera and configuration. It is this system's to close.
         solver: Makes the full adjustments after loops and merges, see `Mapper`; beside, they are made in processes of their own.
 
     Raises:
@@ -103,6 +104,7 @@ class Slam:
         *,
         keep_records: bool = True,
         beside: bool = False,
+        mapping: MappingService | None = None,
         solver: BundleSolver | None = None,
     ) -> None:
         self._camera = camera
@@ -117,7 +119,7 @@ class Slam:
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
-        self._mapping: MappingService = (
+        self._mapping: MappingService = mapping or (
             MappingProcess(camera, config, make_frame_matcher)
             if beside
             else InlineMapping(Mapper(camera, config, self._matcher if nearest is None else make_frame_matcher(config), solver))

@@ -11,21 +11,21 @@ import subprocess
 import sys
 from pathlib import Path
 
-from ros_graph import FAST, LIMIT_S, Graph
+from ros_graph import EVERY_IMAGE, FAST, IN_STEP, LIMIT_S, Graph
 from rosgraph_msgs.msg import Clock
 
 from thegra_ros.codec.stamps import stamp_ns
 from thegra_ros.qos import RELIABLE
 
 THEGRA = [sys.executable, "-m", "thegra_core.cli.main"]
-PARAMETERS = [argument for name, value in FAST.items() if name != "profile" for argument in ("-p", f"{name}:={value}")]
+PARAMETERS = [argument for name, value in (FAST | EVERY_IMAGE | IN_STEP).items() if name != "profile" for argument in ("-p", f"{name}:={value}")]
 
 
 @pytest.mark.slow
 def test_a_recording_is_played_and_tracked(graph: Graph, recording_path: Path, frames, tmp_path: Path) -> None:
     clock = graph.listen(Clock, "/clock", RELIABLE)
     live_log, play_log = (tmp_path / "live.log").open("w"), (tmp_path / "play.log").open("w")
-    live = subprocess.Popen([*THEGRA, "live", "--profile", "fast", "--ros-args", *PARAMETERS, "-p", "use_sim_time:=true", "-p", "queue_size:=100"],
+    live = subprocess.Popen([*THEGRA, "live", "--profile", "fast", "--ros-args", *PARAMETERS, "-p", "use_sim_time:=true"],
                             env=graph.environment, stdout=live_log, stderr=subprocess.STDOUT)  # fmt: skip
     play = subprocess.Popen([*THEGRA, "play", str(recording_path), "--rate", "0.5", "--clock", "--wait", str(LIMIT_S)], env=graph.environment, stdout=play_log, stderr=subprocess.STDOUT)
     try:
