@@ -114,15 +114,16 @@ class Slam:
         self._extractor = TurnableExtractor(extractor if extractor is not None else make_extractor(config.extractor))
         nearest = Nearest(config.matcher) if config.tracking.match_by == "nearest" and matcher is None else None
         self._matcher = make_frame_matcher(config, nearest or matcher)
+        thorough = make_frame_matcher(config) if nearest is not None else None
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
         self._mapping: MappingService = (
             MappingProcess(camera, config, make_frame_matcher)
             if beside
-            else InlineMapping(Mapper(camera, config, self._matcher if nearest is None else make_frame_matcher(config), solver))
+            else InlineMapping(Mapper(camera, config, thorough or self._matcher, solver))
         )
-        self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit)
+        self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit, thorough)
         self._frames: list[_Placed] = []
         self._keep_records = keep_records
         self._last_stamp_ns: int | None = None
@@ -170,8 +171,6 @@ class Slam:
             if shutter.recalibrated:
                 self._chain.reset()
                 self._fixed_pattern.forget()
-            if shutter.shutter is not Shutter.OPEN:
-                self._front_end.forget()
             if shutter.shutter is Shutter.JUST_OPENED:
                 self._tracking.reopen()
             output = self._tracking.hold(frame.stamp_ns, shutter.reason) if shutter.shutter is Shutter.CLOSED else self._see(frame)

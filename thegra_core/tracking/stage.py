@@ -135,13 +135,14 @@ class TrackingStage:
     """State of tracking: the place in the current map, the map before it while a new one is on probation, and the search for a first map.
 
     Call `process` (or `hold`) once a frame, hand what it returns to mapping, and `apply` every update that mapping sends back. What takes long at the start
-    of a map is done by `submit`.
+    of a map is done by `submit`. Where the matcher finds too little to place a frame, `thorough` may be asked, a slower one that finds more.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher, submit: Submit = call_now) -> None:
+    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher, submit: Submit = call_now, thorough: Matcher | None = None) -> None:
         self._camera = camera
         self._config = config
         self._matcher = matcher
+        self._thorough = thorough
         self._initializer = Initializer(camera, config, matcher, submit)
         self._place: _Place | None = None
         self._before: _Place | None = None
@@ -192,11 +193,12 @@ class TrackingStage:
             return self._start(features, matches)
         if not place.begun:
             return self._wait_for_map(place, features)
-        if place.lost_frames or place.search_frames:
-            return Wanted.ANEW
+        if place.lost_frames:
+            return Wanted.MORE
         assert features.track_ids is not None
         landmark_ids = place.tracks.of(features.track_ids)
-        found = localize_followed(place.map, features, landmark_ids, place.predict(features.stamp_ns), self._config)
+        predicted = place.predict(features.stamp_ns) if not place.search_frames else None
+        found = localize_followed(place.map, features, landmark_ids, predicted, self._config)
         if isinstance(found, str):
             logger.debug("followed keypoints at %.3f s: %s", features.stamp_ns / 1e9, found)
             return Wanted.ANEW
@@ -355,6 +357,7 @@ class TrackingStage:
         return self._claim(place, features, TrackingOutput(result, keyframe, landmark_ids=found.landmark_ids, matches=matches))
 
     def _accept_followed(self, place: _Place, features: Features, found: Localization, matches: Matches | None) -> TrackingOutput:
+        place.search_frames = 0
         self._note(place, features, found)
         result = self._result(place, features, found, place.reference_id, is_keyframe=False)
         return self._claim(place, features, TrackingOutput(result, landmark_ids=found.landmark_ids, matches=matches))
@@ -437,7 +440,10 @@ class TrackingStage:
         else:
             candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
         least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
-        return relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
+        found = relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
+        if found is None and self._thorough is not None:
+            found = relocalize(place.map, features, [place.reference_id, *candidates], self._thorough, self._config, least)
+        return found
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:
