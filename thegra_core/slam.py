@@ -257,6 +257,8 @@ class Slam:
     def _see(self, frame: Frame) -> TrackingOutput:
         with self._timed("preprocessing"):
             image = self._chain(frame.image, frame.stamp_ns)
+        for keyframe in self._tracking.catch_up():
+            self._mapping.insert(keyframe)
         reference = self._tracking.reference_features
         features, output = self._front(image, frame.stamp_ns, reference)
         if output.dropped_map_id is not None:

@@ -76,9 +76,13 @@ class Mapper:
         return self.settle(keyframe)
 
     def grow(self, keyframe: Keyframe) -> MapUpdate:
-        """The first half of `insert`, for a tracker that waits for the new landmarks: they are not adjusted yet. `settle` has to follow."""
+        """The first half of `insert`, for a tracker that waits for the new landmarks: they are not adjusted yet. `settle` or `leave` has to follow."""
         self._grow(keyframe)
         return self._editors[keyframe.map_id].take_update()
+
+    def leave(self, keyframe: Keyframe) -> None:
+        """Instead of `settle`, where another keyframe waits already: that one's local adjustment takes in this one, its neighbour."""
+        self._loops[keyframe.map_id].index.add(keyframe.id, keyframe.features)
 
     def settle(self, keyframe: Keyframe) -> MapUpdate:
         """The second half of `insert`. A full adjustment that is done comes in before the local one, which smooths the seams to what has come since."""

@@ -202,7 +202,7 @@ def serve(connection: Connection) -> None:
                 mapping = InlineMapping(Mapper(camera, config, make_matcher(config), ProcessSolver()))
                 continue
             assert mapping is not None
-            for answer in _do(mapping, name, arguments):
+            for answer in _do(mapping, name, arguments, connection.poll):
                 connection.send(answer)
         except ConnectionError:  # who asked has gone
             return
@@ -211,10 +211,10 @@ def serve(connection: Connection) -> None:
             return
 
 
-def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...]) -> Iterator[tuple[str, Any]]:
+def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...], others_wait: Callable[[], bool]) -> Iterator[tuple[str, Any]]:
     """What is to be sent back, each as soon as it is there."""
     if name == "insert":
-        for update in mapping.insert_by_halves(*arguments):
+        for update in mapping.insert_by_halves(*arguments, others_wait):
             yield "updates", [update]
     elif name in ("initialize", "drop"):
         getattr(mapping, name)(*arguments)

@@ -77,7 +77,7 @@ class _Place:
     """Where tracking is: a replica of a map and of its places, keyframes of it, and what has been seen since the last one.
 
     resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet, and
-    their poses.
+    their poses. missed: frames that came while mapping made the map.
     """
 
     map: Map
@@ -93,6 +93,7 @@ class _Place:
     found: list[IntArray] = field(default_factory=list)
     tracks: TrackLandmarks = field(default_factory=TrackLandmarks)
     pending: dict[int, FloatArray] = field(default_factory=dict)
+    missed: list[Features] = field(default_factory=list)
 
     @property
     def begun(self) -> bool:
@@ -168,6 +169,21 @@ class TrackingStage:
     @property
     def map_id(self) -> int:
         return self._place.map.map_id if self._place is not None else -1
+
+    def catch_up(self) -> list[Keyframe]:
+        """Call it before each frame: keyframes that are due from the time in which mapping made a new map, for it to insert.
+
+        Keypoints that were followed since then see landmarks that the map holds, but fewer with each frame, and no new ones until there are keyframes. As many
+        frames as may wait for mapping are placed, evenly spread to the newest.
+        """
+        place = self._place
+        if place is None or not place.begun or not place.missed:
+            return []
+        missed, place.missed = [f for f in place.missed if f.track_ids is not None], []
+        most = self._config.keyframe.most_pending
+        rows = np.unique(np.linspace(0, len(missed) - 1, most + 1).round().astype(int)[1:]) if missed else ()
+        due = (self._placed_late(place, missed[row]) for row in rows)
+        return [keyframe for keyframe in due if keyframe is not None]
 
     def process(self, features: Features, matches: Matches | None, turned: Iterable[Features] = ()) -> TrackingOutput:
         """Track one frame; `matches` are to `reference_features` (None: not matched yet). `turned` gives its features of other orientations, taken as needed."""
@@ -313,9 +329,21 @@ class TrackingStage:
             return TrackingOutput(result, matches=matches)
         return self._begin_map(features, initial)
 
+    def _placed_late(self, place: _Place, features: Features) -> Keyframe | None:
+        """A frame that came before its map did, as a keyframe if it finds a place and one is due."""
+        assert features.track_ids is not None
+        predicted = place.predict(features.stamp_ns)
+        found = localize_followed(place.map, features, place.tracks.of(features.track_ids), predicted, self._config)
+        if isinstance(found, str):
+            return None
+        self._note(place, features, found)
+        place.tracks.replace(features, found.landmark_ids)
+        return self._as_keyframe(place, features, found, self._matcher.match(features, place.reference))
+
     def _wait_for_map(self, place: _Place, features: Features) -> TrackingOutput:
         """Mapping has not made the new map yet."""
         self._unplaced.append(features)
+        place.missed.append(features)
         state = TrackingState.INITIALIZING if self._before is None else TrackingState.LOST
         return TrackingOutput(TrackingResult(features.stamp_ns, state, keypoints=len(features), map_id=place.map.map_id, reason="a new map is being made"))
 
@@ -328,6 +356,7 @@ class TrackingStage:
         self._next_map_id += 1
         self._next_keyframe_id += len(initial.keyframes)
         if last.stamp_ns != features.stamp_ns:  # it was solved meanwhile: the frames to come are tracked in it
+            place.missed = [f for f in self._unplaced if f.stamp_ns > last.stamp_ns]
             return replace(self._wait_for_map(place, features), initial_map=initial)
         keypoints = np.flatnonzero(last.landmark_ids != NO_LANDMARK)
         estimate = FrameView(features, self._camera, self._config).refine(
