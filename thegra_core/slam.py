@@ -18,9 +18,9 @@ from thegra_core.errors import MappingError
 from thegra_core.features.front_end import DetectAndFollow, DetectEach
 from thegra_core.features.nearest import Nearest
 from thegra_core.features.protocols import Extractor, FrontEnd, Matcher, Wanted
-from thegra_core.features.registry import make_extractor, make_frame_matcher
-from thegra_core.features.tracks import shared_tracks
-from thegra_core.features.turning import TurnableExtractor
+from thegra_core.features.registry import make_extractor, make_frame_matcher, make_matcher
+from thegra_core.features.tracks import TrackMatcher, shared_tracks
+from thegra_core.features.turning import TurnableExtractor, TurningMatcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map, summarize
 from thegra_core.mapping.mapper import Mapper
@@ -114,14 +114,15 @@ class Slam:
         self._extractor = TurnableExtractor(extractor if extractor is not None else make_extractor(config.extractor))
         nearest = Nearest(config.matcher) if config.tracking.match_by == "nearest" and matcher is None else None
         self._matcher = make_frame_matcher(config, nearest or matcher)
-        thorough = make_frame_matcher(config) if nearest is not None else None
+        learned = make_matcher(config.matcher, config.extractor) if nearest is not None else None
+        thorough = TrackMatcher(TurningMatcher(learned), 10**9) if learned is not None else None
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
         self._mapping: MappingService = (
             MappingProcess(camera, config, make_frame_matcher)
             if beside
-            else InlineMapping(Mapper(camera, config, thorough or self._matcher, solver))
+            else InlineMapping(Mapper(camera, config, make_frame_matcher(config, learned) if learned is not None else self._matcher, solver))
         )
         self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit, thorough)
         self._frames: list[_Placed] = []
@@ -257,8 +258,10 @@ class Slam:
     def _see(self, frame: Frame) -> TrackingOutput:
         with self._timed("preprocessing"):
             image = self._chain(frame.image, frame.stamp_ns)
-        for keyframe in self._tracking.catch_up():
-            self._mapping.insert(keyframe)
+        with self._timed("mapping"):
+            self._take_updates()  # of keyframes that were made meanwhile: the frame needs their landmarks
+            for keyframe in self._tracking.catch_up():
+                self._mapping.insert(keyframe)
         reference = self._tracking.reference_features
         features, output = self._front(image, frame.stamp_ns, reference)
         if output.dropped_map_id is not None:

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from thegra_core.config import FlowConfig
-from thegra_core.features.flow import coarse_shift, follow, normalize_contrast, patch_similarity
+from thegra_core.features.flow import follow, normalize_contrast, patch_similarity
 from thegra_core.features.front_end import DetectAndFollow, DetectEach, merged
 from thegra_core.features.protocols import Wanted
+from thegra_core.features.registration import coarse_shift, follow_far, overlap_shift
 from thegra_core.features.tracks import TrackMatcher, shared_tracks
 from thegra_core.messages import Features, Matches
 

@@ -188,12 +188,35 @@ class MappingProcess:
                 return
 
 
+class _Inbox:
+    """What comes over a connection, in order, with a look at what waits."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._waiting: deque[tuple[str, tuple[Any, ...]]] = deque()
+
+    def next(self) -> tuple[str, tuple[Any, ...]]:
+        """Wait for the next message.
+
+        Raises:
+            EOFError, OSError: If the connection has ended.
+        """
+        return self._waiting.popleft() if self._waiting else self._connection.recv()
+
+    def work_waits(self) -> bool:
+        """Whether tracking waits for a keyframe or a first map to be worked on."""
+        while self._connection.poll():
+            self._waiting.append(self._connection.recv())
+        return any(name in ("insert", "call") for name, _ in self._waiting)
+
+
 def serve(connection: Connection) -> None:
     """Do what comes over the connection, in order, until it ends."""
+    inbox = _Inbox(connection)
     mapping: InlineMapping | None = None
     while True:
         try:
-            name, arguments = connection.recv()
+            name, arguments = inbox.next()
         except (EOFError, OSError):
             return
         try:
@@ -202,9 +225,9 @@ def serve(connection: Connection) -> None:
                 mapping = InlineMapping(Mapper(camera, config, make_matcher(config), ProcessSolver()))
                 continue
             assert mapping is not None
-            for answer in _do(mapping, name, arguments, connection.poll):
+            for answer in _do(mapping, name, arguments, inbox.work_waits):
                 connection.send(answer)
-        except ConnectionError:  # who asked has gone
+        except (ConnectionError, EOFError):  # who asked has gone
             return
         except Exception as error:
             connection.send(("failed", error if isinstance(error, ThegraError) else traceback.format_exc()))
@@ -214,7 +237,7 @@ def serve(connection: Connection) -> None:
 def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...], others_wait: Callable[[], bool]) -> Iterator[tuple[str, Any]]:
     """What is to be sent back, each as soon as it is there."""
     if name == "insert":
-        for update in mapping.insert_by_halves(*arguments, others_wait):
+        for update in mapping.insert_by_steps(*arguments, others_wait):
             yield "updates", [update]
     elif name in ("initialize", "drop"):
         getattr(mapping, name)(*arguments)

@@ -30,7 +30,7 @@ from thegra_core.messages import (
 )
 from thegra_core.places.index import PlaceIndex
 from thegra_core.process import Submit, call_now
-from thegra_core.tracking.followed import TrackLandmarks, localize_followed
+from thegra_core.tracking.followed import NotPlaced, TrackLandmarks, localize_followed
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
 from thegra_core.tracking.motion import MotionModel
@@ -202,7 +202,8 @@ class TrackingStage:
     def process_followed(self, features: Features, matches: Matches | None) -> TrackingOutput | Wanted:
         """Track one frame by keypoints that were followed to it; `matches` as for `process`.
 
-        Instead of an answer, what `process` should get of the same image: more features if a keyframe is due, other ones if these give no pose.
+        Instead of an answer, what `process` should get of the same image: more features if a keyframe is due or these give no pose, other ones if these are
+        wrong.
         """
         place = self._place
         if place is None:
@@ -215,9 +216,9 @@ class TrackingStage:
         landmark_ids = place.tracks.of(features.track_ids)
         predicted = place.predict(features.stamp_ns) if not place.search_frames else None
         found = localize_followed(place.map, features, landmark_ids, predicted, self._config)
-        if isinstance(found, str):
-            logger.debug("followed keypoints at %.3f s: %s", features.stamp_ns / 1e9, found)
-            return Wanted.ANEW
+        if isinstance(found, NotPlaced):
+            logger.debug("followed keypoints at %.3f s: %s", features.stamp_ns / 1e9, found.reason)
+            return Wanted.ANEW if found.misled else Wanted.MORE
         if self._keyframe_due(place, found):
             return Wanted.MORE
         return self._accept_followed(place, features, found, matches)
@@ -334,7 +335,7 @@ class TrackingStage:
         assert features.track_ids is not None
         predicted = place.predict(features.stamp_ns)
         found = localize_followed(place.map, features, place.tracks.of(features.track_ids), predicted, self._config)
-        if isinstance(found, str):
+        if isinstance(found, NotPlaced):
             return None
         self._note(place, features, found)
         place.tracks.replace(features, found.landmark_ids)
@@ -471,7 +472,7 @@ class TrackingStage:
         least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
         found = relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
         if found is None and self._thorough is not None:
-            found = relocalize(place.map, features, [place.reference_id, *candidates], self._thorough, self._config, least)
+            found = relocalize(place.map, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, self._config, least)
         return found
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
