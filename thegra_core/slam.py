@@ -24,6 +24,7 @@ from thegra_core.features.turning import TurnableExtractor, TurningMatcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map, summarize
 from thegra_core.mapping.mapper import Mapper
+from thegra_core.mapping.lockstep import LockstepMapping
 from thegra_core.mapping.process import MappingProcess
 from thegra_core.mapping.service import InlineMapping, MappingService
 from thegra_core.messages import (
@@ -88,6 +89,7 @@ class Slam:
         extractor, matcher: Instead of those configured.
         keep_records: Remember every frame for `finish`. A live stream has no end and needs only the last one.
         beside: Map in a process of its own, with the matcher configured: `process` never waits for it, and what becomes of a run depends on the machine.
+        lockstep: Map in a process of its own, too, but take what comes of it at fixed frames, waiting for it if need be: the same frames give the same run.
         solver: Makes the full adjustments after loops and merges, see `Mapper`; beside, they are made in processes of their own.
 
     Raises:
@@ -103,6 +105,7 @@ class Slam:
         *,
         keep_records: bool = True,
         beside: bool = False,
+        lockstep: bool = False,
         solver: BundleSolver | None = None,
     ) -> None:
         self._camera = camera
@@ -119,11 +122,13 @@ class Slam:
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
-        self._mapping: MappingService = (
-            MappingProcess(camera, config, make_frame_matcher)
-            if beside
-            else InlineMapping(Mapper(camera, config, make_frame_matcher(config, learned) if learned is not None else self._matcher, solver))
-        )
+        self._mapping: MappingService
+        if beside:
+            self._mapping = MappingProcess(camera, config, make_frame_matcher)
+        elif lockstep:
+            self._mapping = LockstepMapping(MappingProcess(camera, config, make_frame_matcher, timely=False))
+        else:
+            self._mapping = InlineMapping(Mapper(camera, config, make_frame_matcher(config, learned) if learned is not None else self._matcher, solver))
         self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit, thorough)
         self._frames: list[_Placed] = []
         self._keep_records = keep_records
@@ -258,12 +263,14 @@ class Slam:
     def _see(self, frame: Frame) -> TrackingOutput:
         with self._timed("preprocessing"):
             image = self._chain(frame.image, frame.stamp_ns)
+        with self._timed("flow"):
+            followed = self._front_end.follow(image, frame.stamp_ns)
         with self._timed("mapping"):
-            self._take_updates()  # of keyframes that were made meanwhile: the frame needs their landmarks
+            self._take_updates()  # of keyframes that came before: this frame needs their landmarks
             for keyframe in self._tracking.catch_up():
                 self._mapping.insert(keyframe)
         reference = self._tracking.reference_features
-        features, output = self._front(image, frame.stamp_ns, reference)
+        features, output = self._front(image, frame.stamp_ns, followed, reference)
         if output.dropped_map_id is not None:
             self._drop(output.dropped_map_id)
         with self._timed("mapping"):
@@ -281,10 +288,10 @@ class Slam:
         for degrees in self._rotations:
             yield self._fixed_pattern.apply(self._extractor.turned(image, stamp_ns, degrees // 90))
 
-    def _front(self, image: NDArray[np.uint8], stamp_ns: int, reference: Features | None) -> tuple[Features, TrackingOutput]:
+    def _front(
+        self, image: NDArray[np.uint8], stamp_ns: int, followed: Features | None, reference: Features | None
+    ) -> tuple[Features, TrackingOutput]:
         """Features of the image and what tracking made of them: of those followed, if there are any and they suffice, else of what is detected."""
-        with self._timed("flow"):
-            followed = self._front_end.follow(image, stamp_ns)
         wanted = Wanted.MORE
         if followed is not None:
             features = self._fixed_pattern.apply(followed)

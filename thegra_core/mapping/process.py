@@ -47,11 +47,15 @@ MakeMatcher = Callable[[ThegraConfig], Matcher]
 class MappingProcess:
     """`MappingService` in a process of its own with one thread.
 
+    Args:
+        make_matcher: See `MakeMatcher`.
+        timely: Work is left out where more waits, and full adjustments have processes of their own. Without it what comes of the work does not depend on time.
+
     Raises:
         WeightsError: If the matcher's weights are not there; from the first call that waits for an answer, or `updates`.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, make_matcher: MakeMatcher) -> None:
+    def __init__(self, camera: CameraModel, config: ThegraConfig, make_matcher: MakeMatcher, *, timely: bool = True) -> None:
         ours, theirs = socket.socketpair()
         with theirs:
             command = [sys.executable, "-c", _LAUNCH, str(theirs.fileno())]
@@ -63,19 +67,20 @@ class MappingProcess:
         self._writer.start()
         self._updates: list[MapUpdate] = []
         self._submitted: deque[Future[Any]] = deque()
-        self._tell("begin", camera, config, make_matcher)
+        self._undone = 0
+        self._tell("begin", camera, config, make_matcher, timely)
 
     def initialize(self, initial: InitialMap) -> None:
         """See `MappingService.initialize`."""
-        self._tell("initialize", initial)
+        self._give("initialize", initial)
 
     def insert(self, keyframe: Keyframe) -> None:
         """See `MappingService.insert`."""
-        self._tell("insert", keyframe)
+        self._give("insert", keyframe)
 
     def drop(self, map_id: int) -> None:
         """See `MappingService.drop`."""
-        self._tell("drop", map_id)
+        self._give("drop", map_id)
 
     def updates(self) -> list[MapUpdate]:
         """See `MappingService.updates`."""
@@ -83,6 +88,27 @@ class MappingProcess:
             self._take(self._receive())
         taken, self._updates = self._updates, []
         return taken
+
+    def next_updates(self) -> list[MapUpdate]:
+        """`updates`, and if there are none, wait for the next ones; none if all is done that was handed over.
+
+        Raises:
+            MappingError: As `updates`.
+        """
+        while not self._updates and self._undone:
+            self._take(self._receive())
+        taken, self._updates = self._updates, []
+        return taken
+
+    def last_updates(self) -> list[MapUpdate]:
+        """The updates still to come of what was handed over; waits until all is done.
+
+        Raises:
+            MappingError: As `updates`.
+        """
+        while self._undone:
+            self._take(self._receive())
+        return self.updates()
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """See `MappingService.submit`."""
@@ -135,6 +161,10 @@ class MappingProcess:
 
     # ---- steps ----------------------------------------------------------------------------------------------------------------------
 
+    def _give(self, name: str, argument: Any) -> None:
+        self._undone += 1
+        self._tell(name, argument)
+
     def _tell(self, name: str, *arguments: Any) -> None:
         self._outbox.put((name, arguments))
 
@@ -156,6 +186,9 @@ class MappingProcess:
             raise MappingError(f"the process of the mapping stage has failed:\n{content}")
         if kind == "result":
             self._submitted.popleft().set_result(content)
+            return
+        if kind == "done":
+            self._undone -= 1
             return
         self._updates.extend(content)
 
@@ -214,6 +247,7 @@ def serve(connection: Connection) -> None:
     """Do what comes over the connection, in order, until it ends."""
     inbox = _Inbox(connection)
     mapping: InlineMapping | None = None
+    others_wait = _never
     while True:
         try:
             name, arguments = inbox.next()
@@ -221,11 +255,12 @@ def serve(connection: Connection) -> None:
             return
         try:
             if name == "begin":
-                camera, config, make_matcher = arguments
-                mapping = InlineMapping(Mapper(camera, config, make_matcher(config), ProcessSolver()))
+                camera, config, make_matcher, timely = arguments
+                mapping = InlineMapping(Mapper(camera, config, make_matcher(config), ProcessSolver() if timely else None))
+                others_wait = inbox.work_waits if timely else _never
                 continue
             assert mapping is not None
-            for answer in _do(mapping, name, arguments, inbox.work_waits):
+            for answer in _do(mapping, name, arguments, others_wait):
                 connection.send(answer)
         except (ConnectionError, EOFError):  # who asked has gone
             return
@@ -234,14 +269,20 @@ def serve(connection: Connection) -> None:
             return
 
 
+def _never() -> bool:
+    return False
+
+
 def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...], others_wait: Callable[[], bool]) -> Iterator[tuple[str, Any]]:
     """What is to be sent back, each as soon as it is there."""
     if name == "insert":
         for update in mapping.insert_by_steps(*arguments, others_wait):
             yield "updates", [update]
+        yield "done", None
     elif name in ("initialize", "drop"):
         getattr(mapping, name)(*arguments)
         yield "updates", mapping.updates()
+        yield "done", None
     elif name == "call":
         function, *rest = arguments
         yield "result", function(*rest)
