@@ -264,6 +264,7 @@ class TrackingConfig(Section):
     min_descriptor_similarity: float = Field(0.75, ge=-1, le=1, description="cosine of float descriptors; 1 - 2 * Hamming share of binary ones")
     descriptor_ratio: float = Field(0.9, gt=0, le=1, description="best over second-best descriptor distance among candidates")
     chi2_px2: float = Field(5.991, gt=0, description="px^2; 95 % of chi-square with 2 degrees of freedom at 1 px")
+    least_step: float = Field(1e-8, gt=0, description="radians and map units; a step below it ends a round of the pose's adjustment; 1e-5 is a two-hundredth of a pixel")
     mask_fixed_pattern: bool = Field(True, description="learn where keypoints stay on one pixel while the image moves, and use none there")
 
 

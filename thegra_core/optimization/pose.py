@@ -50,13 +50,15 @@ def refine_pose(
     focal: float,
     weights: FloatArray,
     chi2: float = 5.991,
+    least_step: float = 1e-8,
 ) -> PoseEstimate:
     """Least robust weighted reprojection error over one pose.
 
     Four rounds of at most ten Gauss-Newton steps; after each, observations beyond the gate sit out the next round, grossly wrong ones the first; the
     Huber kernel is off in the last.
     points_world (N, 3); normalized (N, 2) undistorted; focal in px turns their differences into pixels; weights (N,) 1/px^2; chi2
-    (px^2) limits squared pixel residuals, whatever the weights. Undefined (NaN) observations are outliers.
+    (px^2) limits squared pixel residuals, whatever the weights; a step below least_step (rad, map units) ends a round. Undefined (NaN) observations are
+    outliers.
     """
     pose = camera_from_world
     start = (focal * triangulation.reprojection_errors(pose, points_world, normalized)) ** 2
@@ -65,7 +67,7 @@ def refine_pose(
     hessian = np.eye(6)
     for round_index in range(ROUNDS):
         robust = round_index < ROUNDS - 1
-        pose, hessian = _gauss_newton(pose, points_world[inliers], normalized[inliers], focal, weights[inliers], np.sqrt(chi2) if robust else np.inf)
+        pose, hessian = _gauss_newton(pose, points_world[inliers], normalized[inliers], focal, weights[inliers], np.sqrt(chi2) if robust else np.inf, least_step)
         squared = (focal * triangulation.reprojection_errors(pose, points_world, normalized)) ** 2
         inliers = squared < chi2
         if inliers.sum() < 4:
@@ -78,7 +80,7 @@ def refine_pose(
 
 
 def _gauss_newton(
-    pose: FloatArray, points_world: FloatArray, normalized: FloatArray, focal: float, weights: FloatArray, huber: float
+    pose: FloatArray, points_world: FloatArray, normalized: FloatArray, focal: float, weights: FloatArray, huber: float, least_step: float
 ) -> tuple[FloatArray, FloatArray]:
     hessian = np.eye(6)
     for _ in range(STEPS):
@@ -96,7 +98,7 @@ def _gauss_newton(
         gradient = np.einsum("nij,ni->j", weighted, residual)
         step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
         pose = poses.transform(poses.so3_exp(step[:3]), step[3:]) @ pose
-        if float(np.abs(step).max()) < 1e-8:
+        if float(np.abs(step).max()) < least_step:
             break
     return pose, hessian
 
