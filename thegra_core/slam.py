@@ -23,8 +23,8 @@ from thegra_core.features.tracks import TrackMatcher, shared_tracks
 from thegra_core.features.turning import TurnableExtractor, TurningMatcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map, summarize
-from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.lockstep import LockstepMapping
+from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.process import MappingProcess
 from thegra_core.mapping.service import InlineMapping, MappingService
 from thegra_core.messages import (

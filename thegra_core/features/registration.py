@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +68,7 @@ def _homography(points: Points, known: Followed) -> tuple[FloatArray | None, int
     homography, agreeing = cv2.findHomography(points[known.found], known.points[known.found], cv2.USAC_MAGSAC, HOMOGRAPHY_PX, None, 2000, 0.999)
     if homography is None or not np.isfinite(homography).all() or agreeing.sum() < LEAST_POINTS:
         return None, 0
-    return homography, int(agreeing.sum())
+    return np.asarray(homography, np.float64), int(agreeing.sum())
 
 
 def _straightened(before: Image, after: Image, points: Points, homography: FloatArray, config: FlowConfig) -> Followed:
@@ -87,5 +89,5 @@ def _shrunk(*images: Image) -> list[NDArray[np.float32]]:
     return [cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) for image in images]
 
 
-def _in_full_size(shift: tuple[float, float], image: Image, small: NDArray[np.float32]) -> Points:
+def _in_full_size(shift: Sequence[float], image: Image, small: NDArray[np.float32]) -> Points:
     return np.asarray(np.array(shift) * np.array(image.shape[::-1]) / np.array(small.shape[::-1]), np.float32)

@@ -276,7 +276,8 @@ def _never() -> bool:
 def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...], others_wait: Callable[[], bool]) -> Iterator[tuple[str, Any]]:
     """What is to be sent back, each as soon as it is there."""
     if name == "insert":
-        for update in mapping.insert_by_steps(*arguments, others_wait):
+        (keyframe,) = arguments
+        for update in mapping.insert_by_steps(keyframe, others_wait):
             yield "updates", [update]
         yield "done", None
     elif name in ("initialize", "drop"):
