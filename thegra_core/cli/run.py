@@ -28,6 +28,7 @@ from thegra_core.outputs.write import RecordingFacts, write_run
 from thegra_core.process import Usage, set_threads
 from thegra_core.sources.open import camera_for, open_recording
 from thegra_core.sources.playback import Playback
+from thegra_core.sources.read_ahead import read_ahead
 from thegra_core.sources.recording import Recording
 from thegra_core.version import VERSION
 
@@ -112,10 +113,10 @@ def run_recording(options: RunOptions) -> int:
     groundtruth = _groundtruth(options, recording)
     viewer = make_viewer(options.viewer)
     out = options.out or Path("runs") / f"{recording.name}_{started:%Y%m%dT%H%M%SZ}"
-    with _log_file(out), make_progress(options.quiet, _expected_frames(options, recording)) as progress, _interrupts() as interrupted:
+    with log_file(out), make_progress(options.quiet, _expected_frames(options, recording)) as progress, _interrupts() as interrupted:
         for line in (f"thegra {VERSION}, profile {config.profile}, seed {config.seed}", f"input {recording.path}", f"arguments {shlex.join(sys.argv[1:])}", *recording.notes):
             _log.info("%s", line)
-        front_end = _cached_front_end(config, options.cache)
+        front_end = cached_front_end(config, options.cache)
         system = make_live_system(camera, config) if options.realtime else make_system(camera, config, *front_end)
         with closing(system):
             if options.map is not None:
@@ -128,7 +129,7 @@ def run_recording(options: RunOptions) -> int:
                 system.warm_up()
                 done, wall_s = _play(system, frames, recording, progress, viewer, interrupted)
             else:
-                done, wall_s = _process(system, frames, recording, progress, viewer, interrupted)
+                done, wall_s = _process(system, read_ahead(frames), recording, progress, viewer, interrupted)
             if done.frames == 0 and done.interrupted:
                 raise KeyboardInterrupt
             if done.frames == 0:
@@ -165,7 +166,7 @@ def make_system(camera: CameraModel, config: ThegraConfig, extractor: Extractor 
     set_threads(config.threads)
     from thegra_core.slam import Slam
 
-    return Slam(camera, config, extractor, matcher)
+    return Slam(camera, config, extractor, matcher, lockstep=config.mapping.lockstep)
 
 
 def make_live_system(camera: CameraModel, config: ThegraConfig) -> System:
@@ -176,7 +177,8 @@ def make_live_system(camera: CameraModel, config: ThegraConfig) -> System:
     return Slam(camera, config, beside=True)
 
 
-def _cached_front_end(config: ThegraConfig, folder: Path | None) -> tuple[()] | tuple[CachedExtractor, CachedMatcher]:
+def cached_front_end(config: ThegraConfig, folder: Path | None) -> tuple[()] | tuple[CachedExtractor, CachedMatcher]:
+    """Extractor and matcher of the configuration that keep their results in a folder; nothing without one."""
     if folder is None:
         return ()
     from thegra_core.features.cache import cached_extractor, cached_matcher
@@ -319,7 +321,12 @@ def _weights(config: ThegraConfig) -> dict[str, str]:
 
 
 @contextmanager
-def _log_file(out: Path) -> Iterator[None]:
+def log_file(out: Path) -> Iterator[None]:
+    """Write what the package logs to `out`/thegra.log.
+
+    Raises:
+        InputError: If it cannot be written.
+    """
     logger = logging.getLogger("thegra_core")
     try:
         out.mkdir(parents=True, exist_ok=True)
