@@ -72,10 +72,7 @@ class FrontendNode(StageNode):
             self._forget()
         if notice.shutter.recalibrated:
             self._pattern.forget()
-        if notice.shutter.shutter is not Shutter.OPEN:
-            self._front.forget()
-        if "image" in item:
-            self._see(frame_from_image(item["image"], 0), notice.frame_id)
+        self._see(frame_from_image(item["image"], 0), notice.frame_id)
 
     def begin_anew(self, why: str) -> None:
         self._forget()
@@ -137,7 +134,8 @@ class FrontendNode(StageNode):
         if part == "image":
             self.health.image_came()
         for frame in self._joiner.add(part, stamp_ns(message), message):
-            self.enqueue(frame)
+            if "image" in frame:
+                self.enqueue(frame)
 
     def _on_reference(self, message: Header) -> None:
         self._reference_ns = stamp_ns(message)

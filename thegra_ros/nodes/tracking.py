@@ -23,7 +23,9 @@ from std_srvs.srv import SetBool, Trigger
 from thegra_core.errors import InputError
 from thegra_core.features.nearest import Nearest
 from thegra_core.features.protocols import Wanted
-from thegra_core.features.registry import make_frame_matcher
+from thegra_core.features.registry import make_frame_matcher, make_matcher
+from thegra_core.features.tracks import TrackMatcher
+from thegra_core.features.turning import TurningMatcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Matches, Shutter, TrackingResult, TrackingState
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
@@ -39,7 +41,7 @@ from thegra_ros.joiner import FrameJoiner
 from thegra_ros.lifecycle import run_node
 from thegra_ros.outputs import PoseOutputs
 from thegra_ros.qos import LATCHED, LOSSLESS
-from thegra_ros.stage_node import StageNode
+from thegra_ros.stage_node import EVERYTHING, StageNode
 from thegra_ros.transforms import stamped_pose
 
 PATIENCE_S = 5.0
@@ -84,8 +86,10 @@ class TrackingNode(StageNode):
         self.listen(PointCloud2, "map_update", LOSSLESS, self._on_update)
 
     def load(self) -> None:
-        nearest = Nearest(self.config.matcher) if self.config.tracking.match_by == "nearest" else None
-        self._matcher = make_frame_matcher(self.config, nearest)
+        learned = make_matcher(self.config.matcher, self.config.extractor)
+        quick = Nearest(self.config.matcher) if self.config.tracking.match_by == "nearest" else None
+        self._matcher = make_frame_matcher(self.config, quick or learned)
+        self._thorough = TrackMatcher(TurningMatcher(learned), EVERYTHING) if quick is not None else None
 
     def work(self, item: Mapping[str, Any]) -> None:
         self._unanswered = "followed" in item
@@ -144,7 +148,7 @@ class TrackingNode(StageNode):
             self._beginning = Beginning.RESUME
             self._told(TrackingResult(stamp, TrackingState.LOST, reason="only localisation is on, and mapping has no map: give it a map_file, or call ~/localization_only with false"))
             return None
-        self._stage = TrackingStage(camera, self.config, self._matcher)
+        self._stage = TrackingStage(camera, self.config, self._matcher, thorough=self._thorough)
         if kind == "resume":
             taken = tables[0].facts
             self._stage.resume(tables_update(tables[1:]), int(taken["next_map"]), int(taken["next_keyframe"]))
