@@ -23,6 +23,7 @@ REQUIRES = [
     "rosbags>=0.11",
     "mcap>=1.2",
     "numba>=0.60",
+    "threadpoolctl>=3.1",
     "poselib>=2.0.4",
     "pydantic>=2.7",
     "PyYAML>=6.0",

@@ -215,13 +215,14 @@ class FlowConfig(Section):
 
     enabled: bool = Field(False, description="detect on keyframes and where following fails, follow by Lucas-Kanade in between; off: detect in every frame, as in the paper")
     window: int = Field(15, ge=5, le=61, description="px; side of the square that is followed (measured: 21 takes 1.3 times as long and keeps 2 to 4 % more points)")
-    levels: int = Field(4, ge=0, le=8, description="halvings of the image; 4 follow 80 px (measured)")
+    levels: int = Field(3, ge=0, le=8, description="halvings of the image; the first shift is known, and a fourth takes 1 ms more and finds no more points (measured)")
     max_back_px: float = Field(1.0, gt=0, description="px by which a point followed there and back may miss where it came from")
     patch: int = Field(15, ge=5, le=31, description="px; side of the square whose look is compared before and after")
     min_similarity: float = Field(0.7, ge=-1, le=1, description="least zero-mean normalized cross-correlation of the squares")
     border: int = Field(4, ge=0, le=64, description="px at the image's edge where nothing is followed")
     min_points: int = Field(80, ge=8, description="points below which new ones are detected")
     min_share: float = Field(0.4, ge=0, le=1, description="the same, as a share of the points after the last detection")
+    far_share: float = Field(0.5, ge=0, le=1, description="share of one frame's points found in the next below which they are sought with more effort: after missing frames, a closed shutter, a quick turn (video finds 0.8 to 0.95 at once, measured)")
     near_px: float = Field(4.0, gt=0, description="px around a followed point in which a detection is the same point")
     min_shared: int = Field(50, ge=8, description="tracks that two frames must share for these to be their matches; learned matching where they share fewer")
 
@@ -278,6 +279,7 @@ class KeyframeConfig(Section):
 class MappingConfig(Section):
     """Growing and cleaning the map."""
 
+    lockstep: bool = Field(False, description="for recordings: map in a process of its own while tracking goes on, with answers at fixed frames, so that a run can be repeated; off: one after the other")
     covisibility_threshold: int = Field(15, ge=1, description="shared landmarks that make an edge; ORB-SLAM3: 15")
     neighbours: int = Field(3, ge=1, le=30, description="covisible keyframes that a new keyframe is matched to, its reference among them; ORB-SLAM3: 30, with learned matching each but the reference costs a network run")
     chained_keyframes: int = Field(10, ge=0, description="keyframes that a new one is matched to through a common neighbour, without the network")

@@ -26,7 +26,8 @@ def set_threads(count: int) -> None:
     A brief wait is near the better of the two in both cases (measured).
 
     Args:
-        count: 0: one a core, `MOST_THREADS` at most. `OMP_NUM_THREADS` wins over it. A count given is OpenCV's, too, which else takes all cores.
+        count: 0: one a core, `MOST_THREADS` at most. `OMP_NUM_THREADS` wins over it. A count given is OpenCV's and numpy's, too, which else take all cores: a
+            product of small matrices then waits for a thread on a core that mapping has.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     os.environ.setdefault("OMP_NUM_THREADS", str(count or min(cores, MOST_THREADS)))
@@ -34,8 +35,10 @@ def set_threads(count: int) -> None:
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
     if count:
         import cv2
+        from threadpoolctl import threadpool_limits
 
         cv2.setNumThreads(count)
+        threadpool_limits(count, user_api="blas")  # of the libraries that are loaded; those to come read OMP_NUM_THREADS
 
 
 def keep_freed_memory() -> None:

@@ -18,11 +18,12 @@ from thegra_core.errors import MappingError
 from thegra_core.features.front_end import DetectAndFollow, DetectEach
 from thegra_core.features.nearest import Nearest
 from thegra_core.features.protocols import Extractor, FrontEnd, Matcher, Wanted
-from thegra_core.features.registry import make_extractor, make_frame_matcher
-from thegra_core.features.tracks import shared_tracks
-from thegra_core.features.turning import TurnableExtractor
+from thegra_core.features.registry import make_extractor, make_frame_matcher, make_matcher
+from thegra_core.features.tracks import TrackMatcher, shared_tracks
+from thegra_core.features.turning import TurnableExtractor, TurningMatcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map, summarize
+from thegra_core.mapping.lockstep import LockstepMapping
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.process import MappingProcess
 from thegra_core.mapping.service import InlineMapping, MappingService
@@ -88,6 +89,8 @@ class Slam:
         extractor, matcher: Instead of those configured.
         keep_records: Remember every frame for `finish`. A live stream has no end and needs only the last one.
         beside: Map in a process of its own, with the matcher configured: `process` never waits for it, and what becomes of a run depends on the machine.
+        mapping: Maps instead of what `beside` says; without a map, and of the same camera and configuration. It is this system's to close.
+        lockstep: Map in a process of its own, too, but take what comes of it at fixed frames, waiting for it if need be: the same frames give the same run.
         solver: Makes the full adjustments after loops and merges, see `Mapper`; beside, they are made in processes of their own.
 
     Raises:
@@ -103,6 +106,8 @@ class Slam:
         *,
         keep_records: bool = True,
         beside: bool = False,
+        mapping: MappingService | None = None,
+        lockstep: bool = False,
         solver: BundleSolver | None = None,
     ) -> None:
         self._camera = camera
@@ -114,15 +119,21 @@ class Slam:
         self._extractor = TurnableExtractor(extractor if extractor is not None else make_extractor(config.extractor))
         nearest = Nearest(config.matcher) if config.tracking.match_by == "nearest" and matcher is None else None
         self._matcher = make_frame_matcher(config, nearest or matcher)
+        learned = make_matcher(config.matcher, config.extractor) if nearest is not None else None
+        thorough = TrackMatcher(TurningMatcher(learned), 10**9) if learned is not None else None
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
-        self._mapping: MappingService = (
-            MappingProcess(camera, config, make_frame_matcher)
-            if beside
-            else InlineMapping(Mapper(camera, config, self._matcher if nearest is None else make_frame_matcher(config), solver))
-        )
-        self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit)
+        self._mapping: MappingService
+        if mapping is not None:
+            self._mapping = mapping
+        elif beside:
+            self._mapping = MappingProcess(camera, config, make_frame_matcher)
+        elif lockstep:
+            self._mapping = LockstepMapping(MappingProcess(camera, config, make_frame_matcher, timely=False))
+        else:
+            self._mapping = InlineMapping(Mapper(camera, config, make_frame_matcher(config, learned) if learned is not None else self._matcher, solver))
+        self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit, thorough)
         self._frames: list[_Placed] = []
         self._keep_records = keep_records
         self._last_stamp_ns: int | None = None
@@ -170,8 +181,6 @@ class Slam:
             if shutter.recalibrated:
                 self._chain.reset()
                 self._fixed_pattern.forget()
-            if shutter.shutter is not Shutter.OPEN:
-                self._front_end.forget()
             if shutter.shutter is Shutter.JUST_OPENED:
                 self._tracking.reopen()
             output = self._tracking.hold(frame.stamp_ns, shutter.reason) if shutter.shutter is Shutter.CLOSED else self._see(frame)
@@ -258,8 +267,14 @@ class Slam:
     def _see(self, frame: Frame) -> TrackingOutput:
         with self._timed("preprocessing"):
             image = self._chain(frame.image, frame.stamp_ns)
+        with self._timed("flow"):
+            followed = self._front_end.follow(image, frame.stamp_ns)
+        with self._timed("mapping"):
+            self._take_updates()  # of keyframes that came before: this frame needs their landmarks
+            for keyframe in self._tracking.catch_up():
+                self._mapping.insert(keyframe)
         reference = self._tracking.reference_features
-        features, output = self._front(image, frame.stamp_ns, reference)
+        features, output = self._front(image, frame.stamp_ns, followed, reference)
         if output.dropped_map_id is not None:
             self._drop(output.dropped_map_id)
         with self._timed("mapping"):
@@ -277,10 +292,10 @@ class Slam:
         for degrees in self._rotations:
             yield self._fixed_pattern.apply(self._extractor.turned(image, stamp_ns, degrees // 90))
 
-    def _front(self, image: NDArray[np.uint8], stamp_ns: int, reference: Features | None) -> tuple[Features, TrackingOutput]:
+    def _front(
+        self, image: NDArray[np.uint8], stamp_ns: int, followed: Features | None, reference: Features | None
+    ) -> tuple[Features, TrackingOutput]:
         """Features of the image and what tracking made of them: of those followed, if there are any and they suffice, else of what is detected."""
-        with self._timed("flow"):
-            followed = self._front_end.follow(image, stamp_ns)
         wanted = Wanted.MORE
         if followed is not None:
             features = self._fixed_pattern.apply(followed)

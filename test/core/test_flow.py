@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from thegra_core.config import FlowConfig
-from thegra_core.features.flow import coarse_shift, follow, normalize_contrast, patch_similarity
+from thegra_core.features.flow import follow, normalize_contrast, patch_similarity
 from thegra_core.features.front_end import DetectAndFollow, DetectEach, merged
 from thegra_core.features.protocols import Wanted
+from thegra_core.features.registration import coarse_shift, follow_far, overlap_shift
 from thegra_core.features.tracks import TrackMatcher, shared_tracks
 from thegra_core.messages import Features, Matches
 
@@ -90,6 +91,52 @@ def test_similarity_knows_neither_brightness_nor_contrast() -> None:
     assert patch_similarity(image, inverted, points, points, 9).max() < -0.99
 
 
+# ---- what has moved far -----------------------------------------------------------------------------------------------------------
+
+
+def large(seed: int = 0) -> np.ndarray:
+    """A picture wide enough for images that share but a part."""
+    noise = np.random.default_rng(seed).normal(size=(2 * HEIGHT, 3 * WIDTH)).astype(np.float32)
+    blobs = cv2.GaussianBlur(noise, (0, 0), 4) + 6 * cv2.GaussianBlur(noise, (0, 0), 25)
+    return cv2.normalize(blobs, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def part(picture: np.ndarray, dx: float, dy: float, zoom: float = 1.0, turn_deg: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """As `view`, of a large picture: the camera has also come nearer by `zoom`."""
+    matrix = cv2.getRotationMatrix2D((1.5 * WIDTH, HEIGHT), turn_deg, zoom)
+    matrix[:, 2] -= [WIDTH + dx, HEIGHT / 2 + dy]
+    return cv2.warpAffine(picture, matrix, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR), matrix
+
+
+FAR = [(150, -40, 1.0, 0.0), (-130, 30, 1.05, 3.0), (0, 0, 1.35, 0.0), (100, 20, 1.15, -6.0)]
+
+
+@pytest.mark.parametrize(("dx", "dy", "zoom", "turn_deg"), FAR)
+def test_what_moved_far_is_found_with_more_effort(dx: float, dy: float, zoom: float, turn_deg: float) -> None:
+    picture = large()
+    (first, at_first), (second, at_second) = part(picture, 0, 0), part(picture, dx, dy, zoom, turn_deg)
+    first, second, points = normalize_contrast(first), normalize_contrast(second), grid(16, 20)
+    there = moved(points, at_first, at_second)
+    shared = ((there > 12) & (there < np.array([WIDTH, HEIGHT]) - 13)).all(axis=1)
+    near = follow(first, second, points, points + coarse_shift(first, second), CONFIG)
+    far = follow_far(first, second, points, near, CONFIG)
+    right = far.found & (np.linalg.norm(far.points - there, axis=1) < 1.5)
+    assert right[shared].mean() > 0.7
+    assert right.sum() > 0.8 * far.found.sum()
+
+
+def test_the_shift_of_what_two_images_share_is_found() -> None:
+    picture = large()
+    first, second = (normalize_contrast(part(picture, dx, dy)[0]) for dx, dy in ((0, 0), (150, -40)))
+    np.testing.assert_allclose(overlap_shift(first, second), [-150, 40], atol=8)
+
+
+def test_another_picture_is_not_found_with_more_effort() -> None:
+    first, second, points = normalize_contrast(part(large(0), 0, 0)[0]), normalize_contrast(part(large(1), 0, 0)[0]), grid(16, 20)
+    near = follow(first, second, points, points, CONFIG)
+    assert follow_far(first, second, points, near, CONFIG).found.mean() < 0.2
+
+
 # ---- the front ends ---------------------------------------------------------------------------------------------------------------
 
 
@@ -155,6 +202,15 @@ def test_detecting_anew_forgets_the_tracks() -> None:
     assert len(shared_tracks(end.detect(Wanted.ANEW), first)) == 0
 
 
+def test_images_may_be_missing_between_two_that_share_half() -> None:
+    picture, (end, corners) = large(), front_end()
+    end.follow(part(picture, 0, 0)[0], 0)
+    first = end.detect()
+    end.follow(part(picture, 150, -40)[0], 1)
+    pairs = shared_tracks(end.detect(), first)
+    assert len(pairs) > 30 and corners.calls == 2
+
+
 def test_another_scene_is_not_followed() -> None:
     end, corners = front_end()
     end.follow(view(texture(0), 0, 0)[0], 0)
@@ -197,12 +253,13 @@ def features(count: int, ids: list[int] | None, stamp_ns: int = 0) -> Features:
 class Learned:
     name = "learned"
 
-    def __init__(self) -> None:
+    def __init__(self, *pairs: tuple[int, int]) -> None:
         self.asked = 0
+        self.pairs = np.array(pairs, np.int32).reshape(-1, 2)
 
     def match(self, query: Features, reference: Features) -> Matches:
         self.asked += 1
-        return Matches(query.stamp_ns, reference.stamp_ns, np.empty((0, 2), np.int32), np.empty(0, np.float32))
+        return Matches(query.stamp_ns, reference.stamp_ns, self.pairs, np.full(len(self.pairs), 0.5, np.float32))
 
     def match_many(self, query: Features, references: list[Features]) -> list[Matches]:
         return [self.match(query, r) for r in references]
@@ -215,8 +272,16 @@ def test_tracks_are_matches_where_they_are_enough() -> None:
     found = matcher.match(query, near)
     assert found.indices.tolist() == [[0, 3], [2, 0], [3, 2]] and (found.stamp_ns, found.reference_stamp_ns) == (1, 2)
     assert learned.asked == 0
-    assert [len(m) for m in matcher.match_many(query, [near, far, plain])] == [3, 0, 0]
+    assert [len(m) for m in matcher.match_many(query, [near, far, plain])] == [3, 1, 0]
     assert learned.asked == 2
+
+
+def test_too_few_tracks_are_kept_beside_what_the_matcher_finds() -> None:
+    matcher = TrackMatcher(Learned((0, 1), (1, 0), (2, 2)), 3)
+    query, reference = features(4, [7, 5, 9, 2], 1), features(5, [8, 10, 11, 7, 0], 2)
+    found = matcher.match(query, reference)
+    assert found.indices.tolist() == [[0, 3], [1, 0], [2, 2]], "a track is believed, and its keypoints are free for nothing else"
+    assert found.confidence.tolist() == [1.0, 0.5, 0.5]
 
 
 def test_there_are_never_more_keypoints_than_allowed() -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +16,11 @@ from thegra_core.config import FlowConfig, ThegraConfig
 from thegra_core.errors import MappingError, WeightsError
 from thegra_core.features.protocols import Wanted
 from thegra_core.features.tracks import TrackMatcher
+from thegra_core.mapping.lockstep import SETTLED_AFTER, LockstepMapping
+from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.process import MappingProcess
-from thegra_core.messages import Features, MapUpdate, Run, TrackingResult, TrackingState
+from thegra_core.mapping.service import MOST_LEFT, InlineMapping
+from thegra_core.messages import Features, Keyframe, MapUpdate, Run, TrackingResult, TrackingState
 from thegra_core.slam import Slam
 
 FOLLOWING = CONFIG.model_copy(update={"flow": FlowConfig(enabled=True)})
@@ -139,12 +144,25 @@ def test_where_following_misleads_the_frame_is_matched_anew() -> None:
     assert slam.finish().losses == 0
 
 
-def test_a_closure_is_not_followed_through() -> None:
+def test_points_that_are_found_again_after_a_closure_are_followed_across() -> None:
+    slam, end, _ = make(WALK)
+    play(slam, 25)
+    image, before = frames(1, 25)[0].image, len(end.asked)
+    held = [slam.process(replace(frame, image=image)) for frame in frames(4, 25)]
+    assert held[-1].state is TrackingState.HOLD
+    results = play(slam, 4, 29)
+    assert all(r.state is TrackingState.TRACKING for r in results)
+    assert Wanted.ANEW not in end.asked[before:]
+    assert slam.finish().losses == 0
+
+
+def test_after_a_closure_that_cannot_be_followed_across_the_frame_is_matched() -> None:
     slam, end, _ = make(WALK)
     play(slam, 25)
     image = frames(1, 25)[0].image
-    held = [slam.process(replace(frame, image=image)) for frame in frames(4, 25)]
-    assert held[-1].state is TrackingState.HOLD and not end.known
+    for frame in frames(4, 25):
+        slam.process(replace(frame, image=image))
+    end.forget()
     assert play(slam, 1, 29)[0].state is TrackingState.TRACKING
     assert slam.finish().losses == 0
 
@@ -212,6 +230,125 @@ def test_new_landmarks_come_before_they_are_adjusted(beside: Slam) -> None:
         np.testing.assert_array_equal(known.keyframes[i].world_from_camera, keyframe.world_from_camera)
 
 
+class Scripted(InlineMapping):
+    """Mapping in which others wait after the steps told."""
+
+    def __init__(self, waits: list[bool]) -> None:
+        super().__init__(Mapper(CAMERA, FOLLOWING, fake_matcher(FOLLOWING)))
+        self.waits = waits
+        self.steps: list[str] = []
+        for name in ("grow", "settle", "tie"):
+            setattr(self._mapper, name, self._noted(name, getattr(self._mapper, name)))
+
+    def _noted(self, name: str, step: Callable[[Keyframe], MapUpdate | None]) -> Callable[[Keyframe], MapUpdate | None]:
+        def noted(keyframe: Keyframe) -> MapUpdate | None:
+            self.steps.append(name)
+            return step(keyframe)
+
+        return noted
+
+    def insert(self, keyframe: Keyframe) -> None:
+        self._updates += self.insert_by_steps(keyframe, lambda: self.waits.pop(0) if self.waits else False)
+
+
+def scripted(waits: list[bool]) -> tuple[Slam, Scripted]:
+    slam, _, _ = make(WALK)
+    slam._mapping = mapping = Scripted(waits)
+    return slam, mapping
+
+
+def test_a_keyframe_is_not_adjusted_while_others_wait() -> None:
+    slam, mapping = scripted([True, False, True])
+    play(slam, 40)
+    assert mapping.steps[:6] == ["grow", "grow", "settle", "grow", "settle", "tie"], "nothing waits after the third"
+    run = slam.finish()
+    assert ate(run, WALK[:40])[0] < 0.005 and run.losses == 0
+
+
+def test_not_more_than_a_few_keyframes_in_a_row_are_left_unadjusted() -> None:
+    slam, mapping = scripted([True] * 1000)
+    play(slam, 60)
+    between = "".join(step[0] for step in mapping.steps).split("st")
+    assert {len(grown) for grown in between[:-1]} == {MOST_LEFT + 1} and len(between[-1]) <= MOST_LEFT
+    assert ate(slam.finish(), WALK)[0] < 0.005
+
+
+def test_a_map_that_took_its_time_is_caught_up_with() -> None:
+    """Frames that came while the first map was solved become keyframes of it, so that there are new landmarks at once."""
+    slam, _, _ = make(WALK)
+    late: list[Callable[[], None]] = []
+
+    def submit(function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        future, solved = Future[Any](), function(*arguments)
+        if isinstance(solved, str):
+            future.set_result(solved)
+        else:
+            late.append(lambda: future.set_result(solved))
+        return future
+
+    slam._tracking._initializer._submit = submit
+    begun = next(i for i in range(60) if slam.process(frames(1, i)[0]) and late)
+    play(slam, 9, begun + 1)
+    late[0]()
+    play(slam, 1, begun + 10)
+    keyframes = slam.map_size()[0]
+    first = play(slam, 1, begun + 11)[0]
+    assert first.state is TrackingState.TRACKING and not first.is_keyframe
+    assert slam.map_size()[0] > keyframes > 0, "keyframes from the time in between"
+    assert all(r.state is TrackingState.TRACKING for r in play(slam, 15, begun + 12))
+    assert slam.finish().losses == 0
+
+
+# ---- the same beside tracking, in lockstep ----------------------------------------------------------------------------------------
+
+
+def in_lockstep(count: int) -> tuple[list[TrackingResult], Run]:
+    slam, _, _ = make(WALK)
+    slam._mapping = LockstepMapping(MappingProcess(CAMERA, FOLLOWING, fake_matcher, timely=False))
+    try:
+        return play(slam, count), slam.finish()
+    finally:
+        slam.close()
+
+
+def test_mapping_in_lockstep_gives_the_same_bytes_and_tracks_as_well() -> None:
+    (results, run), (_, again) = in_lockstep(60), in_lockstep(60)
+    assert [f.world_from_camera.tobytes() for f in run.frames] == [f.world_from_camera.tobytes() for f in again.frames]
+    assert ate(run, WALK)[0] < 0.004 and (run.losses, len(run.maps)) == (0, 1)
+    assert sum(r.is_keyframe for r in results) > 5
+
+
+class Answering:
+    """A process of mapping whose answers are in; notes what it is asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def insert(self, keyframe: int) -> None:
+        self.asked.append(f"insert {keyframe}")
+
+    def next_updates(self) -> list[str]:
+        self.asked.append("next")
+        return ["grown"]
+
+    def last_updates(self) -> list[str]:
+        self.asked.append("last")
+        return ["settled"]
+
+
+def test_answers_in_lockstep_come_at_fixed_calls_and_before_the_next_keyframe() -> None:
+    process = Answering()
+    mapping = LockstepMapping(process)  # type: ignore[arg-type]
+    mapping.insert(1)  # type: ignore[arg-type]
+    mapping.updates()
+    process.asked.clear()
+    assert [mapping.updates() for _ in range(SETTLED_AFTER)] == [["grown"], *[[]] * (SETTLED_AFTER - 3), ["settled"], []]
+    mapping.insert(2)  # type: ignore[arg-type]
+    mapping.insert(3)  # type: ignore[arg-type]
+    assert process.asked == ["next", "last", "last", "insert 2", "last", "insert 3"]
+    assert mapping.updates() == ["settled", "settled"]
+
+
 def test_tracking_goes_on_while_mapping_is_behind(beside: Slam) -> None:
     process_all(beside, 25)
     held_back = beside._mapping.updates
@@ -260,3 +397,18 @@ def test_a_map_can_be_saved_and_read_in_a_process(beside: Slam, tmp_path) -> Non
     results = process_all(slam, 10, 25)
     slam.close()
     assert all(r.state is TrackingState.TRACKING for r in results)
+
+
+def test_a_process_begins_anew_without_what_it_had(beside: Slam) -> None:
+    """What is still in work for the old stream is not told to the new one."""
+    process_all(beside, 25)
+    assert any(r.is_keyframe for r in play(beside, 10, 25))
+    process = beside._mapping
+    process.begin(CAMERA)  # type: ignore[attr-defined]
+    assert process.maps() == [] and process.updates() == []
+    slam, _, _ = make(WALK)
+    slam._mapping = process
+    process_all(slam, 40)
+    run = slam.finish()
+    error, placed = ate(run, WALK[:40])
+    assert error < 0.005 and placed == 40 and [m.map_id for m in run.maps] == [0]

@@ -28,6 +28,7 @@ from thegra_core.outputs.write import RecordingFacts, write_run
 from thegra_core.process import Usage, set_threads
 from thegra_core.sources.open import camera_for, open_recording
 from thegra_core.sources.playback import Playback
+from thegra_core.sources.read_ahead import read_ahead
 from thegra_core.sources.recording import Recording
 from thegra_core.version import VERSION
 
@@ -128,7 +129,7 @@ def run_recording(options: RunOptions) -> int:
                 system.warm_up()
                 done, wall_s = _play(system, frames, recording, progress, viewer, interrupted)
             else:
-                done, wall_s = _process(system, frames, recording, progress, viewer, interrupted)
+                done, wall_s = _process(system, read_ahead(frames), recording, progress, viewer, interrupted)
             if done.frames == 0 and done.interrupted:
                 raise KeyboardInterrupt
             if done.frames == 0:
@@ -165,7 +166,7 @@ def make_system(camera: CameraModel, config: ThegraConfig, extractor: Extractor 
     set_threads(config.threads)
     from thegra_core.slam import Slam
 
-    return Slam(camera, config, extractor, matcher)
+    return Slam(camera, config, extractor, matcher, lockstep=config.mapping.lockstep)
 
 
 def make_live_system(camera: CameraModel, config: ThegraConfig) -> System:

@@ -20,8 +20,6 @@ CONTRAST_LEVELS = 40.0
 """Grey levels of one standard deviation in the normalized image; 3.2 of them fit in 8 bit."""
 LEAST_VARIANCE = 25.0
 """Squared grey levels; below this an area is flat, and its noise is not blown up."""
-COARSE = 8
-"""Factor by which images shrink to look for the shift that they have as a whole."""
 _STEPS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 0.03)
 
 
@@ -42,15 +40,6 @@ def normalize_contrast(image: Image) -> Image:
     variance = cv2.boxFilter(values * values, -1, size) - mean * mean
     scaled = 128 + CONTRAST_LEVELS * (values - mean) / np.sqrt(np.maximum(variance, LEAST_VARIANCE))
     return np.asarray(np.clip(scaled, 0, 255), np.uint8)
-
-
-def coarse_shift(before: Image, after: Image) -> NDArray[np.float32]:
-    """(2,) float32 px by which most of the image has moved, by phase correlation (Kuglin and Hines 1975) to about the pixels of the small image."""
-    height, width = before.shape
-    size = (max(width // COARSE, 8), max(height // COARSE, 8))
-    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) for image in (before, after)]
-    shift, _ = cv2.phaseCorrelate(small[0] - small[0].mean(), small[1] - small[1].mean(), cv2.createHanningWindow(size, cv2.CV_32F))
-    return np.asarray(np.array(shift) * (np.array([width, height]) / np.array(size)), np.float32)
 
 
 def follow(before: Image, after: Image, points: Points, start: Points, config: FlowConfig) -> Followed:

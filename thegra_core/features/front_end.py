@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from thegra_core.config import FlowConfig
-from thegra_core.features.flow import coarse_shift, follow, normalize_contrast
+from thegra_core.features.flow import follow, normalize_contrast
 from thegra_core.features.protocols import Extractor, Wanted
+from thegra_core.features.registration import coarse_shift, follow_far
 from thegra_core.messages import Features
 
 Image = NDArray[np.uint8]
@@ -88,9 +89,10 @@ class DetectAndFollow:
         self._trail = None
 
     def _followed(self, before: _Trail, normalized: Image, stamp_ns: int) -> Features:
-        points = before.features.keypoints
-        start = points + coarse_shift(before.normalized, normalized)
-        result = follow(before.normalized, normalized, points, start, self._config)
+        points, there = before.features.keypoints, (before.normalized, normalized)
+        result = follow(*there, points, points + coarse_shift(*there), self._config)
+        if len(points) and result.found.mean() < self._config.far_share:
+            result = follow_far(*there, points, result, self._config)
         chosen = np.flatnonzero(result.found)
         old = before.features
         assert old.track_ids is not None

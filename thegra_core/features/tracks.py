@@ -11,7 +11,7 @@ from thegra_core.messages import Features, Matches
 
 
 class TrackMatcher:
-    """`Matcher` that pairs keypoints by the number of their track where two frames share `min_shared` tracks, and asks another matcher where they do not."""
+    """`Matcher` that pairs keypoints by the number of their track where two frames share `min_shared` tracks; where they do not, another matcher pairs the rest."""
 
     def __init__(self, matcher: Matcher, min_shared: int) -> None:
         self.name = matcher.name
@@ -21,11 +21,21 @@ class TrackMatcher:
     def match(self, query: Features, reference: Features) -> Matches:
         """See `Matcher.match`."""
         shared = shared_tracks(query, reference)
-        return shared if len(shared) >= self._min_shared else self._matcher.match(query, reference)
+        return shared if len(shared) >= self._min_shared else completed(shared, self._matcher.match(query, reference))
 
     def match_many(self, query: Features, references: Sequence[Features]) -> list[Matches]:
         """See `Matcher.match_many`."""
         return [self.match(query, reference) for reference in references]
+
+
+def completed(first: Matches, second: Matches) -> Matches:
+    """The first matches, and those of the second of the same two frames whose keypoints the first leave free."""
+    if len(first) == 0 or len(second) == 0:
+        return second if len(first) == 0 else first
+    free = ~np.isin(second.indices[:, 0], first.indices[:, 0]) & ~np.isin(second.indices[:, 1], first.indices[:, 1])
+    indices = np.concatenate((first.indices, second.indices[free]))
+    order = np.argsort(indices[:, 0], kind="stable")
+    return Matches(first.stamp_ns, first.reference_stamp_ns, indices[order], np.concatenate((first.confidence, second.confidence[free]))[order])
 
 
 def shared_tracks(query: Features, reference: Features) -> Matches:

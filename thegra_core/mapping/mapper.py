@@ -73,28 +73,25 @@ class Mapper:
     def insert(self, keyframe: Keyframe) -> MapUpdate:
         """Insert a keyframe: observations, culling, expansion with its neighbours, local bundle adjustment; then what it may tie together."""
         self._grow(keyframe)
-        return self.settle(keyframe)
+        self._settle(keyframe)
+        tied = self._tie(keyframe)
+        return tied if tied is not None else self._editors[keyframe.map_id].take_update()
 
     def grow(self, keyframe: Keyframe) -> MapUpdate:
-        """The first half of `insert`, for a tracker that waits for the new landmarks: they are not adjusted yet. `settle` has to follow."""
+        """The first step of `insert`, for a tracker that waits for the new landmarks: they are not adjusted yet."""
         self._grow(keyframe)
         return self._editors[keyframe.map_id].take_update()
 
     def settle(self, keyframe: Keyframe) -> MapUpdate:
-        """The second half of `insert`. A full adjustment that is done comes in before the local one, which smooths the seams to what has come since."""
-        editor = self._editors[keyframe.map_id]
-        self._full.collect(editor)
-        adjust_locally(editor, keyframe.id, self._config)
-        editor.connect(keyframe.id)
-        loops = self._loops[keyframe.map_id]
-        loops.index.add(keyframe.id, keyframe.features)
-        if self._config.loop.enabled:
-            if loops.look(editor, keyframe.id, self._graphs[keyframe.map_id]):
-                self._full.start(editor)
-            merged = self._merge(editor, keyframe.id)
-            if merged is not None:
-                return merged
-        return editor.take_update()
+        """The second step, the local adjustment. It may be left out: that of a later keyframe takes in this one, its neighbour."""
+        self._settle(keyframe)
+        return self._editors[keyframe.map_id].take_update()
+
+    def tie(self, keyframe: Keyframe) -> MapUpdate | None:
+        """The third step, loops and merges, for a keyframe that is settled; None if it ties nothing. It may be left out, too."""
+        before = self.loops
+        tied = self._tie(keyframe)
+        return self._editors[keyframe.map_id].take_update() if tied is None and self.loops != before else tied
 
     def _grow(self, keyframe: Keyframe) -> None:
         editor = self._editors[keyframe.map_id]
@@ -104,6 +101,23 @@ class Mapper:
         self._expand(editor, keyframe)
         editor.connect(keyframe.id)
         self._thin(editor, keyframe.id)
+        self._loops[keyframe.map_id].index.add(keyframe.id, keyframe.features)
+
+    def _settle(self, keyframe: Keyframe) -> None:
+        """A full adjustment that is done comes in before the local one, which smooths the seams to what has come since."""
+        editor = self._editors[keyframe.map_id]
+        self._full.collect(editor)
+        adjust_locally(editor, keyframe.id, self._config)
+        editor.connect(keyframe.id)
+
+    def _tie(self, keyframe: Keyframe) -> MapUpdate | None:
+        """Close loops; the whole of an older map if this keyframe ties its map to that one."""
+        editor, loops = self._editors[keyframe.map_id], self._loops[keyframe.map_id]
+        if not self._config.loop.enabled:
+            return None
+        if loops.look(editor, keyframe.id, self._graphs[keyframe.map_id]):
+            self._full.start(editor)
+        return self._merge(editor, keyframe.id)
 
     def finish(self, map_id: int) -> MapUpdate:
         """Full bundle adjustment of a map at the end of a run."""

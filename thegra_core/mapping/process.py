@@ -1,7 +1,7 @@
 """Mapping in a process of its own, so that tracking never waits for it: bundle adjustment holds Python's global lock for a whole solve.
 
 One connection carries pickled messages both ways, in order. What tracking hands over is written by a thread, for the process reads nothing while it
-solves. The process ends when the connection does.
+solves. The process ends when the connection does, and at once with the process that it belongs to.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from thegra_core.config import ThegraConfig
 from thegra_core.errors import MappingError, ThegraError
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry.camera import CameraModel
+from thegra_core.lifeline import Lifeline, end_with_parent
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.service import InlineMapping
@@ -47,35 +48,53 @@ MakeMatcher = Callable[[ThegraConfig], Matcher]
 class MappingProcess:
     """`MappingService` in a process of its own with one thread.
 
+    Args:
+        make_matcher: See `MakeMatcher`.
+        timely: Work is left out where more waits, and full adjustments have processes of their own. Without it what comes of the work does not depend on time.
+
     Raises:
         WeightsError: If the matcher's weights are not there; from the first call that waits for an answer, or `updates`.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, make_matcher: MakeMatcher) -> None:
+    def __init__(self, camera: CameraModel, config: ThegraConfig, make_matcher: MakeMatcher, *, timely: bool = True) -> None:
         ours, theirs = socket.socketpair()
+        self._lifeline = Lifeline()
         with theirs:
-            command = [sys.executable, "-c", _LAUNCH, str(theirs.fileno())]
+            command = [sys.executable, "-c", _LAUNCH, str(theirs.fileno()), str(self._lifeline.fd)]
             environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment)
+            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno(), self._lifeline.fd], env=environment)
+        self._lifeline.handed_over()
         self._connection = Connection(ours.detach())
         self._outbox: queue.SimpleQueue[tuple[str, tuple[Any, ...]] | None] = queue.SimpleQueue()
         self._writer = threading.Thread(target=self._write, name="thegra mapping writer", daemon=True)
         self._writer.start()
         self._updates: list[MapUpdate] = []
         self._submitted: deque[Future[Any]] = deque()
-        self._tell("begin", camera, config, make_matcher)
+        self._undone = 0
+        self._tell("equip", config, make_matcher, timely)
+        self._tell("begin", camera)
+
+    def begin(self, camera: CameraModel) -> None:
+        """Forget all maps, for another stream or camera: a new process would load everything again. Waits for what is in work.
+
+        Raises:
+            MappingError: If mapping has ended with an error.
+        """
+        self._tell("begin", camera)
+        self._ask("usage")
+        self._updates.clear()
 
     def initialize(self, initial: InitialMap) -> None:
         """See `MappingService.initialize`."""
-        self._tell("initialize", initial)
+        self._give("initialize", initial)
 
     def insert(self, keyframe: Keyframe) -> None:
         """See `MappingService.insert`."""
-        self._tell("insert", keyframe)
+        self._give("insert", keyframe)
 
     def drop(self, map_id: int) -> None:
         """See `MappingService.drop`."""
-        self._tell("drop", map_id)
+        self._give("drop", map_id)
 
     def updates(self) -> list[MapUpdate]:
         """See `MappingService.updates`."""
@@ -83,6 +102,27 @@ class MappingProcess:
             self._take(self._receive())
         taken, self._updates = self._updates, []
         return taken
+
+    def next_updates(self) -> list[MapUpdate]:
+        """`updates`, and if there are none, wait for the next ones; none if all is done that was handed over.
+
+        Raises:
+            MappingError: As `updates`.
+        """
+        while not self._updates and self._undone:
+            self._take(self._receive())
+        taken, self._updates = self._updates, []
+        return taken
+
+    def last_updates(self) -> list[MapUpdate]:
+        """The updates still to come of what was handed over; waits until all is done.
+
+        Raises:
+            MappingError: As `updates`.
+        """
+        while self._undone:
+            self._take(self._receive())
+        return self.updates()
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """See `MappingService.submit`."""
@@ -132,8 +172,13 @@ class MappingProcess:
             self._process.wait()
         self._writer.join()
         self._connection.close()
+        self._lifeline.cut()
 
     # ---- steps ----------------------------------------------------------------------------------------------------------------------
+
+    def _give(self, name: str, argument: Any) -> None:
+        self._undone += 1
+        self._tell(name, argument)
 
     def _tell(self, name: str, *arguments: Any) -> None:
         self._outbox.put((name, arguments))
@@ -156,6 +201,9 @@ class MappingProcess:
             raise MappingError(f"the process of the mapping stage has failed:\n{content}")
         if kind == "result":
             self._submitted.popleft().set_result(content)
+            return
+        if kind == "done":
+            self._undone -= 1
             return
         self._updates.extend(content)
 
@@ -188,37 +236,78 @@ class MappingProcess:
                 return
 
 
+class _Inbox:
+    """What comes over a connection, in order, with a look at what waits."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._waiting: deque[tuple[str, tuple[Any, ...]]] = deque()
+
+    def next(self) -> tuple[str, tuple[Any, ...]]:
+        """Wait for the next message.
+
+        Raises:
+            EOFError, OSError: If the connection has ended.
+        """
+        return self._waiting.popleft() if self._waiting else self._connection.recv()
+
+    def work_waits(self) -> bool:
+        """Whether tracking waits for a keyframe or a first map to be worked on."""
+        while self._connection.poll():
+            self._waiting.append(self._connection.recv())
+        return any(name in ("insert", "call") for name, _ in self._waiting)
+
+
 def serve(connection: Connection) -> None:
     """Do what comes over the connection, in order, until it ends."""
+    inbox = _Inbox(connection)
     mapping: InlineMapping | None = None
+    config: ThegraConfig
+    matcher: Matcher
+    timely = True
+    others_wait = _never
     while True:
         try:
-            name, arguments = connection.recv()
+            name, arguments = inbox.next()
         except (EOFError, OSError):
             return
         try:
+            if name == "equip":
+                config, make_matcher, timely = arguments
+                matcher, others_wait = make_matcher(config), inbox.work_waits if timely else _never
+                continue
             if name == "begin":
-                camera, config, make_matcher = arguments
-                mapping = InlineMapping(Mapper(camera, config, make_matcher(config), ProcessSolver()))
+                if mapping is not None:
+                    for known in mapping.maps():  # also what is solved for them elsewhere
+                        mapping.drop(known.map_id)
+                (camera,) = arguments
+                mapping = InlineMapping(Mapper(camera, config, matcher, ProcessSolver() if timely else None))
                 continue
             assert mapping is not None
-            for answer in _do(mapping, name, arguments):
+            for answer in _do(mapping, name, arguments, others_wait):
                 connection.send(answer)
-        except ConnectionError:  # who asked has gone
+        except (ConnectionError, EOFError):  # who asked has gone
             return
         except Exception as error:
             connection.send(("failed", error if isinstance(error, ThegraError) else traceback.format_exc()))
             return
 
 
-def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...]) -> Iterator[tuple[str, Any]]:
+def _never() -> bool:
+    return False
+
+
+def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...], others_wait: Callable[[], bool]) -> Iterator[tuple[str, Any]]:
     """What is to be sent back, each as soon as it is there."""
     if name == "insert":
-        for update in mapping.insert_by_halves(*arguments):
+        (keyframe,) = arguments
+        for update in mapping.insert_by_steps(keyframe, others_wait):
             yield "updates", [update]
+        yield "done", None
     elif name in ("initialize", "drop"):
         getattr(mapping, name)(*arguments)
         yield "updates", mapping.updates()
+        yield "done", None
     elif name == "call":
         function, *rest = arguments
         yield "result", function(*rest)
@@ -232,7 +321,8 @@ def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...]) -> Iterat
 
 
 def main() -> None:
-    """The process: its argument is the file descriptor of the connection."""
+    """The process: its arguments are the file descriptors of the connection and of the lifeline."""
+    end_with_parent(int(sys.argv[2]))
     os.nice(NICENESS)
     logging.basicConfig(level=logging.WARNING, format="[thegra mapping] %(levelname)s %(message)s")
     keep_freed_memory()

@@ -12,6 +12,9 @@ from thegra_core.mapping.mapper import Mapper
 from thegra_core.messages import InitialMap, Keyframe, MapUpdate
 from thegra_core.process import Usage, call_now
 
+MOST_LEFT = 4
+"""Keyframes in a row that are left before all is done because others wait; fewer than the keyframes that a local adjustment takes in."""
+
 
 class MappingService(Protocol):
     """Takes what tracking hands over without making it wait; `updates` has what came of it.
@@ -82,6 +85,7 @@ class InlineMapping:
     def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
         self._updates: list[MapUpdate] = []
+        self._left = 0
 
     def initialize(self, initial: InitialMap) -> None:
         """See `MappingService.initialize`."""
@@ -92,11 +96,25 @@ class InlineMapping:
         if keyframe.map_id in self._mapper.map_ids:
             self._updates.append(self._mapper.insert(keyframe))
 
-    def insert_by_halves(self, keyframe: Keyframe) -> Iterator[MapUpdate]:
-        """As `insert`, with an update before anything is adjusted: the new landmarks for a tracker that goes on meanwhile."""
-        if keyframe.map_id in self._mapper.map_ids:
-            yield self._mapper.grow(keyframe)
-            yield self._mapper.settle(keyframe)
+    def insert_by_steps(self, keyframe: Keyframe, others_wait: Callable[[], bool]) -> Iterator[MapUpdate]:
+        """As `insert`, with an update after each step: the new landmarks first, for a tracker that goes on meanwhile.
+
+        Where others wait after a step the rest is left out: the next keyframe needs landmarks more than this one needs accuracy, and is adjusted with it. After
+        `MOST_LEFT` keyframes in a row everything is done all the same.
+        """
+        if keyframe.map_id not in self._mapper.map_ids:
+            return
+        self._left += 1
+        yield self._mapper.grow(keyframe)
+        if self._left <= MOST_LEFT and others_wait():
+            return
+        yield self._mapper.settle(keyframe)
+        if self._left <= MOST_LEFT and others_wait():
+            return
+        self._left = 0
+        tied = self._mapper.tie(keyframe)
+        if tied is not None:
+            yield tied
 
     def drop(self, map_id: int) -> None:
         """See `MappingService.drop`."""

@@ -71,15 +71,43 @@ def estimate_hybrid_pose(landmarks: LandmarkView, shared: Sequence[SharedView], 
     rng = np.random.default_rng(seed)
     bearings = epipolar.homogeneous(landmarks.normalized)
     bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
-    best, best_score = None, 0.0
+    drawn = []
     for _ in range(SAMPLES):
         three = rng.choice(count, 3, replace=False)
         for found in poselib.p3p(list(bearings[three]), list(landmarks.points_world[three])):
             pose = poses.transform(found.R, found.t)
-            score = _agreement(pose, landmarks, shared, focal, threshold_px) if np.all(np.isfinite(pose)) else 0.0
-            if score > best_score:
-                best, best_score = pose, score
+            if np.all(np.isfinite(pose)):
+                drawn.append(pose)
+    best, best_score = None, 0.0
+    for pose in _promising(drawn, landmarks, shared, focal, threshold_px):
+        score = _agreement(pose, landmarks, shared, focal, threshold_px)
+        if score > best_score:
+            best, best_score = pose, score
     return best
+
+
+def _promising(drawn: list[FloatArray], landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, threshold_px: float) -> list[FloatArray]:
+    """The poses whose `_agreement` is the highest but for rounding, in their order: all are scored at once, which takes a twentieth of the time."""
+    if not drawn:
+        return []
+    stack = np.stack(drawn)
+    points = landmarks.points_world @ stack[:, :3, :3].transpose(0, 2, 1) + stack[:, None, :3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squared = focal**2 * ((points[..., :2] / points[..., 2:] - landmarks.normalized) ** 2).sum(axis=2)
+    scores = _truncated(np.where(points[..., 2] > 1e-9, squared, np.inf), threshold_px)
+    for view in shared:
+        essentials = np.stack([epipolar.essential(pose @ poses.inverse(view.camera_from_world)) for pose in drawn])
+        there, here = epipolar.homogeneous(view.there), epipolar.homogeneous(view.here)
+        lines_here, lines_there = there @ essentials.transpose(0, 2, 1), here @ essentials
+        scale = (lines_here[..., :2] ** 2).sum(axis=2) + (lines_there[..., :2] ** 2).sum(axis=2)
+        scores += _truncated(focal**2 * (lines_here * here).sum(axis=2) ** 2 / np.maximum(scale, 1e-30), threshold_px)
+    scores = np.nan_to_num(scores, nan=0.0)
+    return [drawn[row] for row in np.flatnonzero(scores >= scores.max() - 1e-6)]
+
+
+def _truncated(squared: FloatArray, threshold_px: float) -> FloatArray:
+    """Sum over the last axis of 1 for an observation without error, 0 beyond the threshold."""
+    return np.asarray(np.maximum(1.0 - squared / threshold_px**2, 0.0).sum(axis=-1))
 
 
 def _agreement(pose: FloatArray, landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, threshold_px: float) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,16 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 MOST_LOST = 0.5
 """Share of the landmarks that may not fit a pose that was found from the predicted one; beyond it the prediction is not trusted."""
+LEAST_RIGHT = 0.25
+"""Share of the landmarks that fit the best pose below which the tracks are taken for wrong, and not for few."""
+
+
+@dataclass(frozen=True, slots=True)
+class NotPlaced:
+    """Why followed keypoints give no pose; misled: they contradict what the map knows of them."""
+
+    reason: str
+    misled: bool = False
 
 
 class TrackLandmarks:
@@ -50,8 +62,8 @@ class TrackLandmarks:
 
 def localize_followed(
     current: Map, features: Features, landmark_ids: IntArray, predicted_world_from_camera: FloatArray | None, config: ThegraConfig
-) -> Localization | str:
-    """Place a frame by the landmarks (N,) of its followed keypoints; a string says why that failed.
+) -> Localization | NotPlaced:
+    """Place a frame by the landmarks (N,) of its followed keypoints, or say why that failed.
 
     No landmark is looked for beside those followed, so that these alone count as visible.
     """
@@ -60,7 +72,7 @@ def localize_followed(
     rows = current.landmarks.rows(landmark_ids)
     keypoints = np.flatnonzero((rows >= 0) & view.defined)
     if len(keypoints) < settings.min_inliers:
-        return f"{len(keypoints)} followed landmarks of at least {settings.min_inliers}"
+        return NotPlaced(f"{len(keypoints)} followed landmarks of at least {settings.min_inliers}")
     points = current.landmarks.points_world[rows[keypoints]]
     estimate = None
     if predicted_world_from_camera is not None:
@@ -68,10 +80,10 @@ def localize_followed(
     if estimate is None or estimate.inliers.sum() < MOST_LOST * len(keypoints):
         pose, count = estimate_pose(points, view.normalized[keypoints], view.focal, RANSAC_THRESHOLD_PX, config.seed)
         if count < settings.min_inliers:
-            return f"{count} inliers of {len(keypoints)} followed landmarks"
+            return NotPlaced(f"{count} inliers of {len(keypoints)} followed landmarks", count < LEAST_RIGHT * len(keypoints))
         estimate = view.refine(pose, points, keypoints, settings.chi2_px2)
     if estimate.inliers.sum() < settings.min_inliers:
-        return f"{int(estimate.inliers.sum())} inliers of {len(keypoints)} followed landmarks"
+        return NotPlaced(f"{int(estimate.inliers.sum())} inliers of {len(keypoints)} followed landmarks")
     found = np.full(len(features), NO_LANDMARK, np.int64)
     found[keypoints[estimate.inliers]] = landmark_ids[keypoints[estimate.inliers]]
     return Localization(estimate.camera_from_world, estimate.covariance, found, np.unique(landmark_ids[keypoints]), len(keypoints))

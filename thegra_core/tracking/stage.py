@@ -30,7 +30,7 @@ from thegra_core.messages import (
 )
 from thegra_core.places.index import PlaceIndex
 from thegra_core.process import Submit, call_now
-from thegra_core.tracking.followed import TrackLandmarks, localize_followed
+from thegra_core.tracking.followed import NotPlaced, TrackLandmarks, localize_followed
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
 from thegra_core.tracking.motion import MotionModel
@@ -77,7 +77,7 @@ class _Place:
     """Where tracking is: a replica of a map and of its places, keyframes of it, and what has been seen since the last one.
 
     resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet, and
-    their poses.
+    their poses. missed: frames that came while mapping made the map.
     """
 
     map: Map
@@ -93,6 +93,7 @@ class _Place:
     found: list[IntArray] = field(default_factory=list)
     tracks: TrackLandmarks = field(default_factory=TrackLandmarks)
     pending: dict[int, FloatArray] = field(default_factory=dict)
+    missed: list[Features] = field(default_factory=list)
 
     @property
     def begun(self) -> bool:
@@ -135,13 +136,14 @@ class TrackingStage:
     """State of tracking: the place in the current map, the map before it while a new one is on probation, and the search for a first map.
 
     Call `process` (or `hold`) once a frame, hand what it returns to mapping, and `apply` every update that mapping sends back. What takes long at the start
-    of a map is done by `submit`.
+    of a map is done by `submit`. Where the matcher finds too little to place a frame, `thorough` may be asked, a slower one that finds more.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher, submit: Submit = call_now) -> None:
+    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher, submit: Submit = call_now, thorough: Matcher | None = None) -> None:
         self._camera = camera
         self._config = config
         self._matcher = matcher
+        self._thorough = thorough
         self._initializer = Initializer(camera, config, matcher, submit)
         self._place: _Place | None = None
         self._before: _Place | None = None
@@ -168,6 +170,21 @@ class TrackingStage:
     def map_id(self) -> int:
         return self._place.map.map_id if self._place is not None else -1
 
+    def catch_up(self) -> list[Keyframe]:
+        """Call it before each frame: keyframes that are due from the time in which mapping made a new map, for it to insert.
+
+        Keypoints that were followed since then see landmarks that the map holds, but fewer with each frame, and no new ones until there are keyframes. As many
+        frames as may wait for mapping are placed, evenly spread to the newest.
+        """
+        place = self._place
+        if place is None or not place.begun or not place.missed:
+            return []
+        missed, place.missed = [f for f in place.missed if f.track_ids is not None], []
+        most = self._config.keyframe.most_pending
+        rows = np.unique(np.linspace(0, len(missed) - 1, most + 1).round().astype(int)[1:]) if missed else ()
+        due = (self._placed_late(place, missed[row]) for row in rows)
+        return [keyframe for keyframe in due if keyframe is not None]
+
     def process(self, features: Features, matches: Matches | None, turned: Iterable[Features] = ()) -> TrackingOutput:
         """Track one frame; `matches` are to `reference_features` (None: not matched yet). `turned` gives its features of other orientations, taken as needed."""
         place = self._place
@@ -187,21 +204,23 @@ class TrackingStage:
     def process_followed(self, features: Features, matches: Matches | None) -> TrackingOutput | Wanted:
         """Track one frame by keypoints that were followed to it; `matches` as for `process`.
 
-        Instead of an answer, what `process` should get of the same image: more features if a keyframe is due, other ones if these give no pose.
+        Instead of an answer, what `process` should get of the same image: more features if a keyframe is due or these give no pose, other ones if these are
+        wrong.
         """
         place = self._place
         if place is None:
             return self._start(features, matches)
         if not place.begun:
             return self._wait_for_map(place, features)
-        if place.lost_frames or place.search_frames:
-            return Wanted.ANEW
+        if place.lost_frames:
+            return Wanted.MORE
         assert features.track_ids is not None
         landmark_ids = place.tracks.of(features.track_ids)
-        found = localize_followed(place.map, features, landmark_ids, place.predict(features.stamp_ns), self._config)
-        if isinstance(found, str):
-            logger.debug("followed keypoints at %.3f s: %s", features.stamp_ns / 1e9, found)
-            return Wanted.ANEW
+        predicted = place.predict(features.stamp_ns) if not place.search_frames else None
+        found = localize_followed(place.map, features, landmark_ids, predicted, self._config)
+        if isinstance(found, NotPlaced):
+            logger.debug("followed keypoints at %.3f s: %s", features.stamp_ns / 1e9, found.reason)
+            return Wanted.ANEW if found.misled else Wanted.MORE
         if self._keyframe_due(place, found):
             return Wanted.MORE
         return self._accept_followed(place, features, found, matches)
@@ -313,9 +332,21 @@ class TrackingStage:
             return TrackingOutput(result, matches=matches)
         return self._begin_map(features, initial)
 
+    def _placed_late(self, place: _Place, features: Features) -> Keyframe | None:
+        """A frame that came before its map did, as a keyframe if it finds a place and one is due."""
+        assert features.track_ids is not None
+        predicted = place.predict(features.stamp_ns)
+        found = localize_followed(place.map, features, place.tracks.of(features.track_ids), predicted, self._config)
+        if isinstance(found, NotPlaced):
+            return None
+        self._note(place, features, found)
+        place.tracks.replace(features, found.landmark_ids)
+        return self._as_keyframe(place, features, found, self._matcher.match(features, place.reference))
+
     def _wait_for_map(self, place: _Place, features: Features) -> TrackingOutput:
         """Mapping has not made the new map yet."""
         self._unplaced.append(features)
+        place.missed.append(features)
         state = TrackingState.INITIALIZING if self._before is None else TrackingState.LOST
         return TrackingOutput(TrackingResult(features.stamp_ns, state, keypoints=len(features), map_id=place.map.map_id, reason="a new map is being made"))
 
@@ -328,6 +359,7 @@ class TrackingStage:
         self._next_map_id += 1
         self._next_keyframe_id += len(initial.keyframes)
         if last.stamp_ns != features.stamp_ns:  # it was solved meanwhile: the frames to come are tracked in it
+            place.missed = [f for f in self._unplaced if f.stamp_ns > last.stamp_ns]
             return replace(self._wait_for_map(place, features), initial_map=initial)
         keypoints = np.flatnonzero(last.landmark_ids != NO_LANDMARK)
         estimate = FrameView(features, self._camera, self._config).refine(
@@ -359,6 +391,7 @@ class TrackingStage:
         return self._claim(place, features, TrackingOutput(result, keyframe, landmark_ids=found.landmark_ids, matches=matches))
 
     def _accept_followed(self, place: _Place, features: Features, found: Localization, matches: Matches | None) -> TrackingOutput:
+        place.search_frames = 0
         self._note(place, features, found)
         result = self._result(place, features, found, place.reference_id, is_keyframe=False)
         return self._claim(place, features, TrackingOutput(result, landmark_ids=found.landmark_ids, matches=matches))
@@ -441,7 +474,10 @@ class TrackingStage:
             candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
         else:
             candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
-        return relocalize(place.map, features, candidates, self._matcher, self._config, nearby, {place.reference_id: matches})
+        found = relocalize(place.map, features, candidates, self._matcher, self._config, nearby, {place.reference_id: matches})
+        if found is None and self._thorough is not None:
+            found = relocalize(place.map, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, self._config, nearby)
+        return found
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:
