@@ -470,10 +470,9 @@ class TrackingStage:
         else:
             candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
         least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
-        found = relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
-        if found is None and self._thorough is not None:
-            found = relocalize(place.map, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, self._config, least)
-        return found
+        if self._thorough is not None:
+            return relocalize(place.map, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, self._config, least)
+        return relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:
