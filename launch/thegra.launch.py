@@ -27,6 +27,8 @@ ARGUMENTS = {
     "single_process": ("true", "true: one node, slam; false: the four stages as nodes of their own"),
     "use_sim_time": ("false", "take the time from /clock, as when a bag is played"),
     "autostart": ("true", "configure and activate the nodes"),
+    "play": ("", "recording to play instead of a camera, whatever `thegra play` takes; with use_sim_time its time is on /clock"),
+    "rate": ("1.0", "times as fast as recorded"),
     "log_level": ("info", "debug, info, warn or error"),
     "rviz": ("false", "start RViz with a view of it"),
 }
@@ -54,9 +56,17 @@ def actions(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         )
         for name in names
     ]
+    if given["play"]:
+        result.append(Node(package=PACKAGE, executable="thegra", arguments=play_arguments(given), remappings=remappings(given), output="screen"))
     if is_true(given["rviz"]):
         result.append(Node(package="rviz2", executable="rviz2", name="rviz", arguments=["-d", str(config / "thegra.rviz")], output="screen"))
     return result
+
+
+def play_arguments(given: dict[str, str]) -> list[str]:
+    """The command line of `thegra play`."""
+    arguments = ["play", given["play"], "--rate", given["rate"], "--namespace", given["namespace"]]
+    return [*arguments, "--clock"] if is_true(given["use_sim_time"]) else arguments
 
 
 def parameters(given: dict[str, str]) -> dict[str, object]:

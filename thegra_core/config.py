@@ -264,7 +264,6 @@ class TrackingConfig(Section):
     min_descriptor_similarity: float = Field(0.75, ge=-1, le=1, description="cosine of float descriptors; 1 - 2 * Hamming share of binary ones")
     descriptor_ratio: float = Field(0.9, gt=0, le=1, description="best over second-best descriptor distance among candidates")
     chi2_px2: float = Field(5.991, gt=0, description="px^2; 95 % of chi-square with 2 degrees of freedom at 1 px")
-    least_step: float = Field(1e-8, gt=0, description="radians and map units; a step below it ends a round of the pose's adjustment; 1e-5 is a two-hundredth of a pixel")
     mask_fixed_pattern: bool = Field(True, description="learn where keypoints stay on one pixel while the image moves, and use none there")
 
 
@@ -318,6 +317,7 @@ class RelocalizationConfig(Section):
     search_keyframes: int = Field(6, ge=1, description="the same after a shutter closure")
     search_frames: int = Field(5, ge=0, description="frames after a closure that are matched to so many before tracking counts as lost")
     min_inliers: int = Field(30, ge=6, description="inliers of an accepted relocalisation")
+    min_visible_share: float = Field(0.2, ge=0, le=1, description="landmarks that agree over those that should be seen from there, of the keyframe that shares most with a lost frame; where another street only looks like it 0.11 to 0.13 agree, at the right place 0.28 to 0.53 (measured, profile realtime)")
     remembered_frames: int = Field(150, ge=0, description="frames without a pose whose features are kept, to be placed in the map afterwards")
     new_map_after_frames: int = Field(5, ge=1, description="frames lost before a new map is begun beside the old one")
 

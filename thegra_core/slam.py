@@ -89,6 +89,7 @@ class Slam:
         extractor, matcher: Instead of those configured.
         keep_records: Remember every frame for `finish`. A live stream has no end and needs only the last one.
         beside: Map in a process of its own, with the matcher configured: `process` never waits for it, and what becomes of a run depends on the machine.
+        mapping: Maps instead of what `beside` says; without a map, and of the same camera and configuration. It is this system's to close.
         lockstep: Map in a process of its own, too, but take what comes of it at fixed frames, waiting for it if need be: the same frames give the same run.
         solver: Makes the full adjustments after loops and merges, see `Mapper`; beside, they are made in processes of their own.
 
@@ -105,6 +106,7 @@ class Slam:
         *,
         keep_records: bool = True,
         beside: bool = False,
+        mapping: MappingService | None = None,
         lockstep: bool = False,
         solver: BundleSolver | None = None,
     ) -> None:
@@ -123,7 +125,9 @@ class Slam:
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
         self._mapping: MappingService
-        if beside:
+        if mapping is not None:
+            self._mapping = mapping
+        elif beside:
             self._mapping = MappingProcess(camera, config, make_frame_matcher)
         elif lockstep:
             self._mapping = LockstepMapping(MappingProcess(camera, config, make_frame_matcher, timely=False))

@@ -10,11 +10,10 @@ from sensor_msgs.msg import CameraInfo
 from thegra_core.errors import CalibrationError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.sources.calibration import camera_from_info, load_camera
-from thegra_ros.diagnostics import Health
+from thegra_ros.diagnostics import COMPLAINT_PERIOD_S, Health
+from thegra_ros.elsewhere import advice
 from thegra_ros.lifecycle import ManagedNode
 from thegra_ros.qos import SENSOR
-
-COMPLAINT_PERIOD_S = 5.0
 
 
 class CameraInput:
@@ -35,6 +34,11 @@ class CameraInput:
             node.listen(CameraInfo, "camera_info", SENSOR, self._on_info)
         node.every(COMPLAINT_PERIOD_S, self._complain)
 
+    @property
+    def described(self) -> str:
+        """The camera in words, for the diagnostics."""
+        return described(self.camera)
+
     def _on_info(self, info: CameraInfo) -> None:
         seen = (tuple(info.k), tuple(info.d), info.distortion_model, info.width, info.height)
         if seen == self._seen:
@@ -48,12 +52,21 @@ class CameraInput:
         before, self.camera = self.camera, camera
         if camera is None:
             return
-        what = f"{camera.image_size[0]}x{camera.image_size[1]}, {camera.model.value}, focal length {camera.focal:.1f} px"
+        what = described(camera)
         if before is not None:
             self._on_change(f"{self._topic} changed to {what}")
         else:
             self._node.get_logger().info(f"camera {what}, from {self._topic}")
 
     def _complain(self) -> None:
-        if self._health.camera_trouble and self._node.active:
-            self._node.get_logger().warning(self._health.camera_trouble)
+        if not self._health.camera_trouble or not self._node.active:
+            return
+        text = self._health.camera_trouble
+        if self._seen is None:
+            text = f"no camera_info yet: {advice(self._node, CameraInfo, self._topic, 'remap camera_info')}. Or give a calibration: thegra live --camera FILE, parameter camera_file"
+        self._node.get_logger().warning(text)
+
+
+def described(camera: CameraModel | None) -> str:
+    """A camera in words."""
+    return "unknown" if camera is None else f"{camera.image_size[0]}x{camera.image_size[1]}, {camera.model.value}, focal length {camera.focal:.1f} px"

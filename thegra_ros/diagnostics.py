@@ -31,6 +31,8 @@ _WORDS = {
     TrackingState.RELOCALIZING: "looking for the place after a closure",
     TrackingState.LOST: "lost",
 }
+COMPLAINT_PERIOD_S = 5.0
+"""What keeps a node from working is logged so often."""
 SILENCE_S = 2.0
 """Without an image received or worked on for so long nothing is OK."""
 
@@ -63,12 +65,12 @@ class Health:
 
 
 class Reporter:
-    """Publishes a node's health on /diagnostics once a second, and when told."""
+    """Publishes a node's health on /diagnostics every so often, and when told."""
 
-    def __init__(self, node: ManagedNode, health: Health, facts: Callable[[], Mapping[str, object]]) -> None:
+    def __init__(self, node: ManagedNode, health: Health, facts: Callable[[], Mapping[str, object]], period_s: float) -> None:
         self._node, self._health, self._facts = node, health, facts
         self._publisher = node.publisher(DiagnosticArray, "/diagnostics", RELIABLE, always=True)
-        node.every(1.0, self.report)
+        node.every(period_s, self.report)
 
     def report(self) -> None:
         """Publish it now."""

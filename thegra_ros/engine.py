@@ -1,39 +1,29 @@
-"""The system as a node uses it: frames in, results out, in a process of its own or in this one. No ROS here.
-
-Bundle adjustment holds Python's global lock while it solves; in the node's process it would starve the callbacks that receive images.
-"""
+"""The system as a node uses it: frames in, results out, in a process of its own or in this one. No ROS here."""
 
 from __future__ import annotations
 
 import logging
 import multiprocessing
-import signal
-import threading
 import time
 import traceback
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from thegra_core.config import ThegraConfig
-from thegra_core.errors import InputError, ThegraError
+from thegra_core.errors import InputError, MappingError, ThegraError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame, MapSummary, Snapshot, TrackingResult
-from thegra_core.process import keep_freed_memory, set_threads
+from thegra_core.process import set_threads
+from thegra_ros.beside import Beside, EngineError
 from thegra_ros.image_slot import make_slot, put, take
 
 if TYPE_CHECKING:
     from thegra_core.features.protocols import Extractor, Matcher
+    from thegra_core.mapping.process import MappingProcess
     from thegra_core.slam import Slam
 
 _log = logging.getLogger(__name__)
-LAST_WORDS_S = 1.0
-"""How long the process may take to end by itself when it is told to."""
-
-
-class EngineError(Exception):
-    """The system could not work on a frame; the next frame begins a new map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +84,7 @@ class Engine(Protocol):
         """Work on a frame, waiting for the result.
 
         Raises:
-            EngineError: If it failed.
+            EngineError: If it failed; the next frame begins a new map.
             ThegraError: If the map of `home` cannot be used.
         """
 
@@ -116,22 +106,29 @@ class LocalEngine:
     def __init__(self, config: ThegraConfig, beside: bool = False) -> None:
         self._config = config
         self._beside = beside
-        self._networks: tuple[Extractor, Matcher] | None = None
+        self._networks: tuple[Extractor, Matcher | None] | None = None
         self._slam: Slam | None = None
+        self._mapping: MappingProcess | None = None
         self._epoch = -1
 
     def start(self) -> None:
         set_threads(self._config.threads)
         from thegra_core.features.registry import make_extractor, make_matcher
 
-        self._networks = make_extractor(self._config.extractor), make_matcher(self._config.matcher, self._config.extractor)
+        learned = self._config.tracking.match_by != "nearest"
+        self._networks = make_extractor(self._config.extractor), make_matcher(self._config.matcher, self._config.extractor) if learned else None
 
     def process(self, job: Job) -> Done:
-        slam = self._slam_for(job)
         try:
+            slam = self._slam_for(job)
             result = slam.process(job.frame)
             view = slam.snapshot() if job.wants_view else None
             return Done(result, view, slam.current_map() if job.wants_map else None)
+        except MappingError as error:
+            self.stop()
+            raise EngineError(str(error)) from error
+        except ThegraError:
+            raise
         except Exception as error:
             self.stop()
             raise EngineError(traceback.format_exc()) from error
@@ -139,6 +136,9 @@ class LocalEngine:
     def obey(self, order: Order) -> str:
         try:
             return self._save(order.path) if isinstance(order, SaveMap) else self._begin_in(order)
+        except MappingError as error:
+            self.stop()
+            raise EngineError(str(error)) from error
         except ThegraError:
             raise
         except Exception as error:
@@ -146,9 +146,10 @@ class LocalEngine:
             raise EngineError(traceback.format_exc()) from error
 
     def stop(self) -> None:
-        if self._slam is not None:
-            self._slam.close()
-        self._slam = None
+        for ending in (self._slam, self._mapping):
+            if ending is not None:
+                ending.close()
+        self._slam = self._mapping = None
 
     def _save(self, path: Path) -> str:
         if self._slam is None:
@@ -158,23 +159,48 @@ class LocalEngine:
 
     def _begin_in(self, order: BeginIn) -> str:
         self._epoch = order.epoch  # also where it cannot be: the frames to come are then in the map that is there
-        self._replace(self._new(order.camera, order.path), order.epoch)
+        mapping = self._new_mapping(order.camera) if self._beside else None
+        made = self._new(order.camera, order.path, mapping)
+        self.stop()
+        self._slam, self._mapping = made, mapping
         return f"the camera is sought in the map of {order.path}"
 
     def _slam_for(self, job: Job) -> Slam:
         if self._slam is None or job.epoch != self._epoch:
-            self._replace(self._new(job.camera, job.home), job.epoch)
+            self._slam = None
+            self._slam = self._new(job.camera, job.home, self._emptied_mapping(job.camera) if self._beside else None)
+            self._epoch = job.epoch
         self._slam.localization_only = job.localization_only
         return self._slam
 
-    def _new(self, camera: CameraModel, home: Path | None) -> Slam:
+    def _emptied_mapping(self, camera: CameraModel) -> MappingProcess:
+        """Mapping's process without a map: the one that is there, if it still is."""
+        try:
+            if self._mapping is not None:
+                self._mapping.begin(camera)
+                return self._mapping
+        except MappingError as error:
+            _log.warning("mapping is started again: %s", error)
+            self.stop()
+        self._mapping = self._new_mapping(camera)
+        return self._mapping
+
+    def _new_mapping(self, camera: CameraModel) -> MappingProcess:
+        from thegra_core.features.registry import make_frame_matcher
+        from thegra_core.mapping.process import MappingProcess
+
+        return MappingProcess(camera, self._config, make_frame_matcher)
+
+    def _new(self, camera: CameraModel, home: Path | None, mapping: MappingProcess | None) -> Slam:
         from thegra_core.optimization.solver import ProcessSolver
         from thegra_core.slam import Slam
 
         if self._networks is None:
             self.start()
-        made = Slam(camera, self._config, *(self._networks or ()), keep_records=False, beside=self._beside, solver=ProcessSolver())
+        made = Slam(camera, self._config, *(self._networks or ()), keep_records=False, mapping=mapping, solver=ProcessSolver())
         try:
+            if mapping is not None:
+                made.warm_up()  # a map that is found before mapping's process is there would be lost again
             if home is not None:
                 made.load_map(home)
         except BaseException:
@@ -182,110 +208,42 @@ class LocalEngine:
             raise
         return made
 
-    def _replace(self, made: Slam, epoch: int) -> None:
-        self.stop()
-        self._slam, self._epoch = made, epoch
-
 
 class ProcessEngine:
-    """The system in a process of its own, which ends with this one."""
+    """The system in a process of its own."""
 
     def __init__(self, config: ThegraConfig) -> None:
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
         self._slot = make_slot(context)
-        self._process = context.Process(target=serve, args=(theirs, config, self._slot), daemon=True, name="thegra engine")
-        self._theirs = theirs
-        self._sending = threading.Lock()
+        self._beside = Beside("thegra engine", SlotEngine, config, self._slot, context=context)
 
     def start(self) -> None:
-        self._process.start()
-        self._theirs.close()
-        answer = self._receive()
-        if isinstance(answer, ThegraError):
-            raise answer
+        self._beside.start()
+        self._beside.call("start")
 
     def process(self, job: Job) -> Done:
-        answer = self._ask(replace(job, frame=put(self._slot, job.frame)))
-        assert isinstance(answer, Done)
-        return answer
+        done = self._beside.call("process", replace(job, frame=put(self._slot, job.frame)))
+        assert isinstance(done, Done)
+        return done
 
     def obey(self, order: Order) -> str:
-        return str(self._ask(order))
+        return str(self._beside.call("obey", order))
 
     def stop(self) -> None:
-        if self._process.pid is None:
-            return
-        try:
-            with self._sending:
-                self._connection.send(None)
-        except (OSError, ValueError):  # it has gone already
-            _log.debug("the engine's process has gone already")
-        self._process.join(LAST_WORDS_S)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
-
-    @property
-    def alive(self) -> bool:
-        return self._process.is_alive()
-
-    def _ask(self, what: Job | Order) -> object:
-        try:
-            with self._sending:
-                self._connection.send(what)
-        except OSError as error:
-            raise EngineError(self._epitaph()) from error
-        answer = self._receive()
-        if isinstance(answer, EngineError | ThegraError):
-            raise answer
-        return answer
-
-    def _receive(self) -> object:
-        try:
-            return self._connection.recv()
-        except (EOFError, OSError) as error:
-            raise EngineError(self._epitaph()) from error
-
-    def _epitaph(self) -> str:
-        self._process.join(LAST_WORDS_S)
-        code = self._process.exitcode
-        return f"the process of the SLAM system has ended with code {code}" + (" (killed; out of memory?)" if code == -signal.SIGKILL else "")
+        self._beside.stop()
 
 
-def serve(connection: Connection, config: ThegraConfig, slot: Any) -> None:
-    """Work on jobs and orders until told to end or the other end is gone; runs in the engine's process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to the whole group; the node tells when to end
-    logging.basicConfig(level=logging.INFO, format="[thegra engine] %(levelname)s %(message)s")
-    keep_freed_memory()
-    engine = LocalEngine(config, beside=True)
-    begin = time.perf_counter()
-    try:
-        engine.start()
-    except ThegraError as error:
-        connection.send(error)
-        return
-    connection.send("ready")
-    _log.info("networks loaded in %.1f s", time.perf_counter() - begin)
-    try:
-        _answer(connection, engine, slot)
-    finally:
-        engine.stop()
+class SlotEngine(LocalEngine):
+    """What runs in that process: the images of its jobs are in the slot, and mapping has a process of its own."""
 
+    def __init__(self, config: ThegraConfig, slot: Any) -> None:
+        super().__init__(config, beside=True)
+        self._slot = slot
 
-def _answer(connection: Connection, engine: LocalEngine, slot: Any) -> None:
-    while True:
-        try:
-            asked = connection.recv()
-        except (EOFError, OSError):
-            return
-        if asked is None:
-            return
-        try:
-            answer: object = engine.process(replace(asked, frame=take(slot, asked.frame))) if isinstance(asked, Job) else engine.obey(asked)
-        except (EngineError, ThegraError) as error:
-            answer = error
-        try:
-            connection.send(answer)
-        except OSError:
-            return
+    def start(self) -> None:
+        begin = time.perf_counter()
+        super().start()
+        _log.info("networks loaded in %.1f s", time.perf_counter() - begin)
+
+    def process(self, job: Job) -> Done:
+        return super().process(replace(job, frame=take(self._slot, job.frame)))

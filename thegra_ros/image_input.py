@@ -11,7 +11,8 @@ from sensor_msgs.msg import CompressedImage, Image
 from thegra_core.messages import Frame
 from thegra_core.sources.image_decoding import DecodeError
 from thegra_ros.codec.images import frame_from_image
-from thegra_ros.diagnostics import Health
+from thegra_ros.diagnostics import COMPLAINT_PERIOD_S, Health
+from thegra_ros.elsewhere import advice
 from thegra_ros.environment import PROFILES_VARIABLE, config_file, profile_is_set
 from thegra_ros.gap_watch import GapWatch
 from thegra_ros.lifecycle import ManagedNode
@@ -29,7 +30,10 @@ class ImageInput:
         self._node, self._health, self._on_frame, self._on_restart = node, health, on_frame, on_restart
         self._stamps, self._gaps, self._index = StampWatch(), GapWatch(), 0
         raw = transport == "raw"
-        node.listen(Image if raw else CompressedImage, "image_raw" if raw else "image_raw/compressed", SENSOR, self._on_image)
+        self._kind, name = (Image, "image_raw") if raw else (CompressedImage, "image_raw/compressed")
+        self._topic = node.resolve_topic_name(name)
+        node.listen(self._kind, name, SENSOR, self._on_image)
+        node.every(COMPLAINT_PERIOD_S, self._complain)
         backwards = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         self._jumps = node.get_clock().create_jump_callback(backwards, post_callback=self._on_jump)
 
@@ -58,6 +62,10 @@ class ImageInput:
         if self._stamps.begins_anew(frame.stamp_ns):
             self._on_restart("the images' stamps went back, as those of a bag that loops do")
         self._on_frame(frame, message.header.frame_id)
+
+    def _complain(self) -> None:
+        if self._node.active and not self._health.images:
+            self._node.get_logger().warning(f"no image yet: {advice(self._node, self._kind, self._topic, 'thegra live --image TOPIC, or remap image_raw')}")
 
     def _tell_loss(self, missing: float | None) -> None:
         if missing is None or missing < MUCH_MISSING or profile_is_set():

@@ -8,6 +8,7 @@ import threading
 import time
 import traceback
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import rclpy
@@ -20,8 +21,11 @@ from thegra_core.errors import ThegraError
 from thegra_ros.answers import answering
 from thegra_ros.qos import publisher_options, subscription_options
 
+WATCH = "end in time"
 WATCH_S = 0.1
-LAST_WORDS_S = 2.5
+WAKE_S = 0.5
+"""A shutdown wakes the executor, but not always; it looks by itself so often."""
+LAST_WORDS_S = 2.3
 """How long a node that is told to end may take to release what it holds."""
 
 
@@ -157,54 +161,66 @@ class ManagedNode(LifecycleNode):
         return guard
 
 
-def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = None) -> int:
-    """Run a node until it is told to end (SIGINT, SIGTERM); the exit code: 0, or 2 if it could not start. The process has to end with it.
+@dataclass
+class _Outcome:
+    """What the process is to end with, for whoever ends it."""
 
-    Where it has not ended `LAST_WORDS_S` later it is ended: a transport that waits for a partner that was killed keeps no node alive.
+    code: int = 0
+
+
+def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = None) -> int:
+    """Run a node until it is told to end (SIGINT, SIGTERM); the exit code: 0, 2 if it could not start, 1 if it failed. The process has to end with it.
+
+    Where it has not ended `LAST_WORDS_S` after its context was shut down it is ended with that code: neither a transport that waits for a partner that was
+    killed nor a thread that still computes keeps a node alive.
     """
-    code = 2
     try:
         rclpy.init(args=arguments)
     except Exception as error:  # RCLError is no public class
         sys.stderr.write(f"thegra: ROS arguments not understood: {error}\n")
         return 2
-    _end_in_time()
+    outcome = _Outcome()
+    threading.Thread(target=_end_in_time, args=(outcome,), daemon=True, name=WATCH).start()
     node: ManagedNode | None = None
     executor = SingleThreadedExecutor()
     try:
         node = make()
         executor.add_node(node)
         if node.start():
-            executor.spin()
-            code = 0
-        elif not rclpy.ok():
-            code = 0
+            while rclpy.ok():
+                executor.spin_once(timeout_sec=WAKE_S)
+        elif rclpy.ok():
+            outcome.code = 2
     except ThegraError as error:
         rclpy.logging.get_logger("thegra").error(str(error))
+        outcome.code = 2
     except (KeyboardInterrupt, ExternalShutdownException):
-        code = 0
+        pass
     except Exception:
-        if rclpy.ok():
-            raise
-        code = 0  # told to end while it was still being made
+        if rclpy.ok():  # else it was told to end while it was still being made
+            traceback.print_exc()
+            outcome.code = 1
     finally:
         if node is not None:
             node.end()
             executor.remove_node(node)
             node.destroy_node()
         rclpy.try_shutdown()
-    return code
+        if any(thread.daemon and thread.name != WATCH for thread in threading.enumerate()):
+            _end(outcome.code)
+    return outcome.code
 
 
-def _end_in_time() -> None:
+def _end_in_time(outcome: _Outcome) -> None:
     """Watch the context: once it is shut down, by a signal or by `run_node` itself, what holds the process up may do so no longer."""
+    while rclpy.ok():
+        time.sleep(WATCH_S)
+    time.sleep(LAST_WORDS_S)
+    _end(outcome.code)
 
-    def watch() -> None:
-        while rclpy.ok():
-            time.sleep(WATCH_S)
-        time.sleep(LAST_WORDS_S)
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(0)
 
-    threading.Thread(target=watch, daemon=True, name="end in time").start()
+def _end(code: int) -> None:
+    """End without Python's own end: a thread that comes back from a network or a solver to an interpreter that is gone takes the process down with it."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)

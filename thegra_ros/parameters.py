@@ -126,7 +126,7 @@ def load_defaults(node: Node) -> ThegraConfig:
         ConfigError: If a file or profile cannot be used.
     """
     own = {
-        "profile": ("", "paper, quality or fast; empty: what config_file names, else quality"),
+        "profile": ("", "paper, quality, fast or realtime; empty: what config_file names, else quality"),
         "config_file": ("", "YAML with parameters as `thegra run --config` takes it; other parameters win over it"),
     }
     values = declare(node, (Declared(n, v, ParameterDescriptor(type=ParameterType.PARAMETER_STRING, description=text, read_only=True)) for n, (v, text) in own.items()))

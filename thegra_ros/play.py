@@ -101,7 +101,7 @@ class Player(Node):
             if not self._options.loop:
                 break
             self.get_logger().info(f"turn {turn + 2} begins")
-        for publisher in filter(None, (self._images, self._infos)):
+        for publisher in filter(None, (self._images, self._infos, self._clock)):
             publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=FLUSH_S))
         self.get_logger().info(f"{count} images played" + "".join(f"; {n} x {reason}" for reason, n in recording.problems.items()))
 

@@ -12,6 +12,7 @@ from typing import Any
 from thegra_core.errors import ThegraError
 from thegra_core.process import keep_freed_memory, set_threads
 from thegra_ros.answers import result_of
+from thegra_ros.beside import EngineError
 from thegra_ros.diagnostics import Health, Reporter
 from thegra_ros.frame_queue import LatestQueue
 from thegra_ros.lifecycle import ManagedNode
@@ -86,7 +87,7 @@ class StageNode(ManagedNode):
         self.config, self.own = self.settings.read()
         set_threads(self.config.threads)
         self.health = Health()
-        self.reporter = Reporter(self, self.health, lambda: {"dropped": self.queue.dropped if self.queue is not None else 0, **self.facts()})
+        self.reporter = Reporter(self, self.health, self._all_facts, self.own.diagnostics_period_s)
         self.queue = LatestQueue(self.queue_size or self.own.queue_size)
         self.stopping.clear()
         self.prepare()
@@ -103,6 +104,9 @@ class StageNode(ManagedNode):
         self.queue = self._thread = None
         self.settings.configured = False
 
+    def _all_facts(self) -> dict[str, object]:
+        return {"dropped": self.queue.dropped if self.queue is not None else 0, **self.facts()}
+
     def _run(self, queue: LatestQueue[Any]) -> None:
         try:
             self.load()
@@ -111,22 +115,32 @@ class StageNode(ManagedNode):
                     _do(item)
                 elif self.active and not self._worked_on(item):
                     return
-        except ThegraError as error:
-            self.tell(str(error))
+        except Exception as error:  # a thread that ends without a word would be a node that does nothing
+            if not self._ends:
+                self.tell(_words(error))
         finally:
             _close(queue)
 
     def _worked_on(self, item: Any) -> bool:
         """Work on an item, whatever becomes of it; False when the node ends."""
+        self.health.trouble = ""  # of the item before
         try:
             self.work(item)
             self.health.done += 1
-        except Exception as error:  # a thread that ends without a word would be a node that does nothing
-            if self.stopping.is_set() or not self.context.ok():
+        except Exception as error:
+            if self._ends:
                 return False
-            self.tell(str(error) if isinstance(error, ThegraError) else traceback.format_exc())
+            self.tell(_words(error))
             self.begin_anew("the stage failed")
         return True
+
+    @property
+    def _ends(self) -> bool:
+        return self.stopping.is_set() or not self.context.ok()
+
+
+def _words(error: Exception) -> str:
+    return str(error) if isinstance(error, ThegraError | EngineError) else traceback.format_exc()
 
 
 def _do(task: _Task) -> None:

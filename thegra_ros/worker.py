@@ -16,6 +16,8 @@ from thegra_ros.frame_queue import LatestQueue
 
 MOST_FAILURES = 3
 """In a row; then the engine is given up."""
+LAST_S = 1.0
+"""How long the work on a frame may go on when the process ends."""
 T = TypeVar("T")
 
 
@@ -61,13 +63,13 @@ class Worker(Generic[T]):
         return asked.answer
 
     def stop(self) -> None:
-        """End, giving up the frame in work; waits until it has ended."""
+        """End, giving up the frame in work; waits until it has ended, but not for long where the process is told to end."""
         self._stopping = True
         self._close()
         if self._engine is not None:
             self._engine.stop()
         if self._thread.ident is not None:
-            self._thread.join()
+            self._thread.join(None if self._is_alive() else LAST_S)
 
     def _close(self) -> None:
         for asked in self.queue.close():
@@ -96,6 +98,8 @@ class Worker(Generic[T]):
     def _work(self) -> None:
         self._engine_worked = 0
         self._engine = self._make_engine()
+        if self._stopping:  # it may have looked for an engine before there was one
+            return
         self._engine.start()
         while (item := self.queue.get()) is not None:
             if isinstance(item, _Asked):

@@ -155,6 +155,16 @@ def test_a_run_without_cache_writes_the_same_bytes_each_time(ran, walk: Path, tm
         assert (tmp_path / name).read_bytes() == (out / "walk" / "quality" / "seed0" / name).read_bytes()
 
 
+def test_runs_at_a_time_change_neither_results_nor_their_order(ran, walk: Path, tmp_path: Path) -> None:
+    _, out, content = ran
+    done = invoke("benchmark", "slam", walk, "--runs", 3, "--workers", 3, "--cache", out.parent / "cache", "--out", tmp_path / "results", *FAST_ENOUGH)
+    at_once = json.loads((tmp_path / "results" / "results.json").read_text())
+    assert done.exit_code == 0
+    assert at_once["results"][0]["seeds"] == [0, 1, 2]
+    assert at_once["results"][0]["ate_rmse"]["seeds"][:2] == content["results"][0]["ate_rmse"]["seeds"]
+    assert "3 runs at a time" in (tmp_path / "results" / "results.md").read_text()
+
+
 # ---- plans ------------------------------------------------------------------------------------------------------------------------
 
 

@@ -397,3 +397,18 @@ def test_a_map_can_be_saved_and_read_in_a_process(beside: Slam, tmp_path) -> Non
     results = process_all(slam, 10, 25)
     slam.close()
     assert all(r.state is TrackingState.TRACKING for r in results)
+
+
+def test_a_process_begins_anew_without_what_it_had(beside: Slam) -> None:
+    """What is still in work for the old stream is not told to the new one."""
+    process_all(beside, 25)
+    assert any(r.is_keyframe for r in play(beside, 10, 25))
+    process = beside._mapping
+    process.begin(CAMERA)  # type: ignore[attr-defined]
+    assert process.maps() == [] and process.updates() == []
+    slam, _, _ = make(WALK)
+    slam._mapping = process
+    process_all(slam, 40)
+    run = slam.finish()
+    error, placed = ate(run, WALK[:40])
+    assert error < 0.005 and placed == 40 and [m.map_id for m in run.maps] == [0]

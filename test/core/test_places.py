@@ -15,7 +15,7 @@ from thegra_core.map.editor import MapEditor
 from thegra_core.messages import NO_LANDMARK, Features, Keyframe, Matches
 from thegra_core.places.descriptor import as_vectors, describe, learn_vocabulary
 from thegra_core.places.index import PlaceIndex
-from thegra_core.places.verification import Sighting, agree, more_than_drift, sight
+from thegra_core.places.verification import Sighting, agree, drift_of, sight
 
 CONFIG = ThegraConfig()
 WORLD = room(seed=3)
@@ -168,7 +168,7 @@ def straight_map(count: int, step: float) -> MapEditor:
 
 def seen_at(pose, scale=1.0):
     empty = np.empty(0, np.int64)
-    return Sighting(20, Similarity(pose, scale), empty, empty, {2: Matches(0, 0, np.empty((0, 2), np.int32), np.empty(0, np.float32))})
+    return Sighting(20, Similarity(pose, scale), empty, empty, {2: Matches(0, 0, np.empty((0, 2), np.int32), np.empty(0, np.float32))}, 0)
 
 
 @pytest.mark.parametrize(
@@ -185,5 +185,6 @@ def seen_at(pose, scale=1.0):
 )
 def test_a_loop_corrects_drift_and_no_more(where, yaw_deg, scale, expected):
     current = straight_map(21, 1.0).map
-    told = more_than_drift(current, seen_at(look(where, yaw_deg), scale), CONFIG.loop)
-    assert (told == "") is expected and (expected or "of the way since" in told)
+    drift = drift_of(current, seen_at(look(where, yaw_deg), scale))
+    assert drift.is_possible(CONFIG.loop) is expected
+    assert drift.turned_deg == pytest.approx(yaw_deg, abs=1e-6) and drift.moved_ratio == pytest.approx(abs(20 - where[0]) / 18)

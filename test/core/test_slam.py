@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from synthetic import BEGIN_NS, CAMERA, PERIOD_NS, FakeExtractor, FakeMatcher, World, cloud, loop, observe, room, sideways, stamp
+from synthetic import BEGIN_NS, CAMERA, PERIOD_NS, FakeExtractor, FakeMatcher, World, cloud, loop, make_world, observe, room, sideways, stamp
 
 from thegra_core.config import HistogramClip, PreprocessingConfig, ThegraConfig
 from thegra_core.geometry.alignment import umeyama
@@ -127,6 +127,28 @@ def test_a_kidnapped_camera_relocalises_when_it_is_put_back() -> None:
     assert (run.losses, run.relocalizations, len(run.maps)) == (1, 1, 1)
     error, placed = ate(run, path)
     assert error < 0.005 and placed == 36
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.2, False), (0.0, True)])
+def test_a_place_that_only_has_something_alike_is_not_this_one(share: float, found: bool) -> None:
+    """An eighth of the points is the same in both rooms, as the cars of two streets are: enough for a pose, not for a place."""
+    here = room(3000)
+    elsewhere = make_world(here.points, seed=99)
+    alike = np.random.default_rng(0).random(len(here.points)) < 0.125
+    elsewhere.descriptors[alike] = here.descriptors[alike]
+    config = CONFIG.model_copy(update={"relocalization": CONFIG.relocalization.model_copy(update={"min_visible_share": share})})
+    path = loop(110)[:25]
+    slam = make(here, path, config)
+    results, _ = play(slam, frames(28))  # the last three show nothing
+    assert results[24].state is TrackingState.TRACKING and results[-1].state is TrackingState.LOST
+    slam.localization_only = True
+    slam._extractor._inner.world = elsewhere  # type: ignore[attr-defined]
+    slam._extractor._inner.poses_by_stamp.update({stamp(28 + i): pose for i, pose in enumerate(path[::5])})  # type: ignore[attr-defined]
+    lost = [slam.process(frame) for frame in frames(5, begin=28)]
+    assert (TrackingState.TRACKING in {r.state for r in lost}) is found
+    slam._extractor._inner.world = here  # type: ignore[attr-defined]
+    slam._extractor._inner.poses_by_stamp.update({stamp(33): path[12]})  # type: ignore[attr-defined]
+    assert slam.process(frames(1, begin=33)[0]).state is TrackingState.TRACKING, "its own place is"
 
 
 def test_a_lost_camera_begins_a_new_map_and_keeps_the_old() -> None:

@@ -27,8 +27,10 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame
+from thegra_ros.benchmark.processes import descendants
+from thegra_ros.camera_input import described
 from thegra_ros.codec.images import camera_info_message, image_message
-from thegra_ros.codec.stamps import header
+from thegra_ros.codec.stamps import header, stamp_ns
 from thegra_ros.lifecycle import ManagedNode
 from thegra_ros.qos import LATCHED, LOSSLESS, RELIABLE
 
@@ -41,6 +43,8 @@ OFFLINE = {name: "[{filter: he_clip}]" if name == "preprocessing.filters" else v
 """The same as overrides of a configuration."""
 EVERY_IMAGE = {f"qos_overrides.{NAMESPACE}/image_raw.subscription.reliability": "reliable", f"qos_overrides.{NAMESPACE}/image_raw.subscription.depth": "1000", "queue_size": "1000"}
 """With these a node receives and works on all that a test sends."""
+OFTEN = {"diagnostics_period_s": "0.1"}
+"""Tests pace their images by what the nodes say that they have worked on."""
 IN_STEP = {"engine": "thread"}
 """Mapping in step with tracking: the poses are those of the offline run, however fast the images come."""
 
@@ -101,7 +105,7 @@ class Graph:
 
     def start(self, module: str = "thegra_ros.nodes.slam", parameters: dict[str, str] | None = None, extra: Sequence[str] = ()) -> NodeProcess:
         log = self._folder / f"{module.rsplit('.', 1)[-1]}_{len(self._processes)}.log"
-        process = NodeProcess(module, {**FAST, **EVERY_IMAGE, **IN_STEP, **(parameters or {})}, self.environment, log, extra)
+        process = NodeProcess(module, {**FAST, **EVERY_IMAGE, **OFTEN, **IN_STEP, **(parameters or {})}, self.environment, log, extra)
         self._processes.append(process)
         return process
 
@@ -141,26 +145,36 @@ class Graph:
     def wait_for_listener(self) -> None:
         self.wait(lambda: self._images.get_subscription_count() > 0 and bool(self.received["/diagnostics"]), "a node that listens to images")
 
-    def send_camera(self, camera: CameraModel, listeners: int = 1) -> None:
-        self.wait(lambda: self._infos.get_subscription_count() >= listeners, "nodes that listen to camera_info")
-        message = camera_info_message(header(0, "thermal_camera"), camera)
-        self._infos.publish(message)
-        self._infos.wait_for_all_acked()
-        if message.k[0] > 0:
-            self.wait(lambda: self._is_known(message), "a node that knows the camera")
+    def spin_until(self, condition: Callable[[], bool], seconds: float) -> None:
+        """Take messages until something is so, or for so long: one of several attempts."""
+        end = time.monotonic() + seconds
+        while not condition() and (rest := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=min(rest, 0.1))
 
-    def _is_known(self, message: CameraInfo) -> bool:
-        """Whether the node says that it has a camera; else it is told again, as drivers do: one message may be lost while the two ends find each other."""
-        if self.value("camera") != "unknown":
-            return True
-        self._infos.publish(message)
-        return False
+    def send_camera(self, camera: CameraModel, *nodes: str, until: Callable[[], bool] | None = None) -> None:
+        """Publish a camera's calibration over and over, as drivers do, until the nodes (`slam` if none is named) say that they have it, or `until` is so.
+
+        One message may be lost: nodes listen with best effort.
+        """
+        message = camera_info_message(header(0, "thermal_camera"), camera)
+        taken = until or (lambda: all(self.said(node, "camera") == described(camera) for node in nodes or ("slam",)))
+        end = time.monotonic() + LIMIT_S
+        while True:
+            self._infos.publish(message)
+            self.spin_until(taken, 0.5)
+            if taken():
+                return
+            assert time.monotonic() < end, "waited in vain for nodes that take the camera\n" + "\n".join(p.output for p in self._processes)
 
     def send(self, frames: Sequence[Frame], encoding: str | None = None) -> None:
         for frame in frames:
             message = image_message(header(frame.stamp_ns, "thermal_camera"), frame.image)
             message.encoding = encoding or message.encoding
             self._images.publish(message)
+
+    def wait_for_pose(self, frame: Frame) -> None:
+        """Wait for the pose of a frame that is tracked: topics overtake each other, and /diagnostics may tell of it sooner."""
+        self.wait(lambda: any(stamp_ns(m) == frame.stamp_ns for m in self.received["pose"]), f"the pose of frame {frame.index}")
 
     def call(self, kind: type, name: str, request: Any) -> Any:
         client = self.node.create_client(kind, name)
@@ -190,7 +204,11 @@ class Graph:
 
     def value(self, key: str) -> str:
         status = self.status
-        return next((v.value for v in status.values if v.key == key), "") if status is not None else ""
+        return _value(status, key) if status is not None else ""
+
+    def said(self, node: str, key: str) -> str:
+        """What a node last said of something, or nothing."""
+        return next((_value(s, key) for m in reversed(self.received["/diagnostics"]) for s in m.status if s.name.endswith(node)), "")
 
     def processed(self) -> int:
         return int(self.value("processed") or 0)
@@ -205,6 +223,15 @@ class Graph:
         self._executor.shutdown()
         self.node.destroy_node()
         self._context.shutdown()
+
+
+def children(pid: int) -> list[int]:
+    """Processes that a node has started for the system, or for its map."""
+    return [child for child in descendants(pid) if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
+
+
+def _value(status: DiagnosticStatus, key: str) -> str:
+    return next((v.value for v in status.values if v.key == key), "")
 
 
 def set_parameter(name: str, value: Any) -> Any:

@@ -12,7 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 import yaml
+
+from thegra_core.cli.extensions import PASS_ON
+from thegra_ros import commands
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -79,6 +83,25 @@ def test_arguments_reach_the_nodes(launch_file: Any, monkeypatch: pytest.MonkeyP
         assert dict(node.kwargs["remappings"]) == {"image_raw": "/boson/image_raw", "image_raw/compressed": "/boson/image_raw/compressed", "camera_info": "/boson/camera_info"}
         assert node.kwargs["parameters"][1] == {"profile": "fast", "base_frame": "base_link", "use_sim_time": True, "autostart": True}
     assert Path(rviz.kwargs["arguments"][1]).is_file()
+
+
+def test_a_recording_is_played_to_the_nodes(launch_file: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command line has to be one that `thegra play` takes, with what launch adds for ROS behind it."""
+    pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ros]")
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "mine.xml")
+    node, play = run(launch_file, play="/data/flight.mcap", rate="0.5", namespace="robot", use_sim_time="true")
+    assert node.kwargs["namespace"] == "robot" and node.kwargs["parameters"][1]["use_sim_time"]
+    command, *arguments = play.kwargs["arguments"]
+    assert (play.kwargs["executable"], command) == ("thegra", "play") and "thegra" in {entry.name for entry in entry_points(group="console_scripts")}
+    taken: list[Any] = []
+    monkeypatch.setattr("thegra_ros.play.play", taken.append)
+    monkeypatch.setattr("thegra_ros.commands.need_ros", lambda name: None)
+    app = typer.Typer()
+    app.command(context_settings=PASS_ON)(commands.play)
+    app([*arguments, "--ros-args", "-r", "image_raw:=/boson/image_raw"], standalone_mode=False)
+    (options,) = taken
+    assert (str(options.recording), options.rate, options.namespace, options.clock) == ("/data/flight.mcap", 0.5, "robot", True)
+    assert options.extra == ("--ros-args", "-r", "image_raw:=/boson/image_raw")
 
 
 def test_executables_of_the_launch_file_are_installed(launch_file: Any) -> None:

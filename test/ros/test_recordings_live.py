@@ -35,6 +35,7 @@ def test_the_trajectory_is_that_of_one_process(graph: Graph, shared_data: Path, 
     alone = {r.stamp_ns: map_pose(r.world_from_camera, Frames()) for r in map(slam.process, frames) if r.state is TrackingState.TRACKING}
     stages = Stages(graph, camera, frames[0])
     stages.send(frames)
+    graph.wait(lambda: {stamp_ns(m) for m in graph.received["pose"]} >= set(alone), "the poses")
     live = {stamp_ns(m): pose_matrix(m.pose.pose) for m in graph.received["pose"]}
     assert len(alone) > 5 and set(live) == set(alone)
     path = np.array([alone[stamp][:3, 3] for stamp in sorted(alone)])

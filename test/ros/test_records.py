@@ -6,17 +6,20 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ros]")
 
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
+from std_msgs.msg import Header
 
 from thegra_core.config import load_config
+from thegra_core.features.protocols import Wanted
 from thegra_core.features.registry import make_extractor, make_matcher
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.messages import Absorbed, Features, MapUpdate, RemovedKeyframe, Revisit
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.tracking.stage import TrackingStage
+from thegra_ros.codec.clouds import cloud_table
 from thegra_ros.codec.records import (
     Assembler,
     features_table,
@@ -31,7 +34,8 @@ from thegra_ros.codec.records import (
     tables_update,
     update_tables,
 )
-from thegra_ros.codec.stamps import header
+from thegra_ros.codec.rounds import SecondRound, is_followed, read_verdict, round_clouds, verdict_message
+from thegra_ros.codec.stamps import header, stamp_ns
 
 
 def send(tables):
@@ -102,6 +106,36 @@ def test_updates_of_loops_are_exact() -> None:
         revisits=(Revisit(2**60 + 3, 2, 8, 4, 77, 0.1, 1.0 / 3), Revisit(5, 2, 9, 4, 50, 0.0, 0.7, 5)),
     )  # fmt: skip
     assert same(tables_update(send(update_tables(update))), update)
+
+
+def test_tracks_keep_their_numbers(records) -> None:
+    features = records["features"][0]
+    numbered = replace(features, track_ids=np.arange(len(features), dtype=np.int64) + 2**40)
+    assert same(table_features(*send([features_table(numbered)])), numbered)
+    followed = replace(records["keyframe"][0], features=replace(records["keyframe"][0].features, track_ids=np.arange(len(records["keyframe"][0].features), dtype=np.int64)))
+    assert same(*tables_keyframes(send(keyframe_tables(followed))), followed)
+
+
+@pytest.mark.parametrize("followed", [True, False])
+def test_both_messages_of_a_round_tell_its_kind(records, followed: bool) -> None:
+    clouds = round_clouds(header(5, "camera"), records["features"][0], records["matches"][0], followed)
+    tables = [cloud_table(deserialize_message(serialize_message(cloud), type(cloud))) for cloud in clouds]
+    assert [is_followed(table) for table in tables] == [followed, followed]
+    assert same(table_features(tables[0]), records["features"][0]) and same(table_matches(tables[1]), records["matches"][0])
+
+
+@pytest.mark.parametrize("wanted", [None, *Wanted])
+def test_what_is_wanted_is_told(wanted: Wanted | None) -> None:
+    message = deserialize_message(serialize_message(verdict_message(7, wanted)), Header)
+    assert read_verdict(message) is wanted and stamp_ns(message) == 7
+
+
+def test_a_second_round_is_there_with_both_parts_in_either_order() -> None:
+    second = SecondRound()
+    for order in (("features", "matches"), ("matches", "features")):
+        second.expect(7)
+        assert second.stamp_ns == 7 and second.add(order[0], "a") is None
+        assert second.add(order[1], "b") == {order[0]: "a", order[1]: "b"} and second.stamp_ns is None
 
 
 def test_a_frame_without_keypoints_keeps_its_facts() -> None:

@@ -6,17 +6,19 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ros]")
 
+import os
+import signal
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from rcl_interfaces.srv import SetParameters
-from ros_graph import OFFLINE, Graph, set_parameter
-from stages import Stages, again, value
+from ros_graph import OFFLINE, Graph, children, set_parameter
+from stages import STAGES, Stages, again
 from std_srvs.srv import SetBool, Trigger
 
 from thegra_core.config import load_config
-from thegra_core.messages import Shutter, ShutterState, TrackingState
+from thegra_core.messages import Frame, Shutter, ShutterState, TrackingState
 from thegra_core.outputs.scoring import align
 from thegra_core.outputs.trajectory import read_tum
 from thegra_core.slam import Slam
@@ -62,15 +64,19 @@ def test_a_frame_that_lost_a_part_holds_nothing_up() -> None:
     assert joined.lost == 1
 
 
+FOLLOWING = {"flow.enabled": "true", "tracking.match_by": "nearest"}
+
+
 @pytest.mark.slow
-def test_four_nodes_track_and_survive(graph: Graph, frames, camera, recording_path) -> None:
-    stages = Stages(graph, camera, frames[0])
-    begin = value(graph, "preprocessing", "images")
-    lost = value(graph, "tracking", "lost parts")
+@pytest.mark.parametrize("following", [{}, FOLLOWING], ids=["detecting in each image", "following keypoints"])
+def test_four_nodes_track_and_survive(graph: Graph, frames, camera, recording_path, following: dict[str, str]) -> None:
+    stages = Stages(graph, camera, frames[0], **dict.fromkeys(STAGES, following))
+    lost = stages.value("tracking", "lost parts")
     stages.send(frames)
+    graph.wait_for_pose(frames[-1])
     live = {stamp_ns(m): m for m in graph.received["pose"]}
     assert len(live) > 15 and set(live) <= {f.stamp_ns for f in frames}
-    slam = Slam(camera, load_config("fast", overrides=OFFLINE))
+    slam = Slam(camera, load_config("fast", overrides=OFFLINE | following))
     alone = {r.stamp_ns: r for r in map(slam.process, frames) if r.state is TrackingState.TRACKING}
     assert set(alone) == set(live)
     for stamp, message in live.items():
@@ -82,53 +88,53 @@ def test_four_nodes_track_and_survive(graph: Graph, frames, camera, recording_pa
     errors = align(found, true).apply(found) - true
     assert np.sqrt((errors**2).sum(axis=1).mean()) < 0.03 * np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
     assert graph.received["map_points"] and graph.received["keyframe_path"]
-    assert value(graph, "tracking", "lost parts") == lost and value(graph, "mapping", "broken records") == 0
+    assert stages.value("tracking", "lost parts") == lost and stages.value("mapping", "broken records") == 0
 
-    before = len(graph.received["pose"])  # the bag begins again
-    for count, frame in enumerate(frames[:18], 1):
-        graph.send([frame])
-        graph.wait(lambda n=count: value(graph, "preprocessing", "images") >= begin + len(frames) + n, f"frame {count} again")
-    graph.wait(lambda: len(graph.received["pose"]) > before, "poses of a new map")
+    graph.received["pose"].clear()  # the bag begins again
+    stages.begin_again(frames[0])
+    stages.send(frames[:18])
+    expected = {stamp for stamp in live if stamp <= frames[17].stamp_ns}
+    graph.wait(lambda: {stamp_ns(m) for m in graph.received["pose"]} == expected, "the same poses in a new map")
     assert stages.nodes["preprocessing"].output.count("begins anew") == 2
     assert stages.end() == [0, 0, 0, 0]
 
 
 @pytest.mark.slow
 def test_a_node_that_is_killed_and_started_again_is_taken_back(graph: Graph, frames, camera, tmp_path) -> None:
-    stages = Stages(graph, camera, frames[0])
+    stages = Stages(graph, camera, frames[0], mapping={"engine": "process"})
     stages.send(frames[:20])
-    poses = {stamp_ns(m): m for m in graph.received["pose"]}
-    assert len(poses) > 3
+    graph.wait_for_pose(frames[19])
     maps = stages.value("mapping", "maps")
 
     kept = tmp_path / "room.map"
-    for node in ("mapping",):
-        assert graph.call(SetParameters, f"{node}/set_parameters", SetParameters.Request(parameters=[set_parameter("map_file", str(kept))])).results[0].successful
+    set_map_file = SetParameters.Request(parameters=[set_parameter("map_file", str(kept))])
+    assert graph.call(SetParameters, "mapping/set_parameters", set_map_file).results[0].successful
     answer = graph.call(Trigger, "mapping/save_map", Trigger.Request())
     assert answer.success and kept.is_file(), answer.message
 
+    def poses_come(frames: list[Frame], least: int, what: str) -> None:
+        before = len(graph.received["pose"])
+        stages.send_until(again(frames), lambda: len(graph.received["pose"]) >= before + least, what)
+
     for name in ("tracking", "frontend", "preprocessing"):
         stages.restart(name, camera)
-        before = len(graph.received["pose"])
-        resent = iter([f for _ in range(30) for f in again(frames[20:24])] if name == "preprocessing" else again(frames[20:24] * 10))
-        while len(graph.received["pose"]) < before + 2:
-            graph.send([next(resent)])
-            graph.spin_for(1.0)
-        assert value(graph, "mapping", "maps") == maps, "no new map was begun"
+        poses_come(frames[20:24], 2, f"poses with a new {name}")
+        assert stages.value("mapping", "maps") == maps, "no new map was begun"
     assert "sought in the map" in stages.nodes["tracking"].output
 
-    stages.restart("mapping", camera)  # it owned the map: a new one begins
-    before = len(graph.received["pose"])
-    resent = iter(again(frames * 3))
-    while "a new map begins" not in stages.nodes["tracking"].output:
-        graph.send([next(resent)])
-        graph.spin_for(1.0)
-    assert graph.call(SetParameters, "mapping/set_parameters", SetParameters.Request(parameters=[set_parameter("map_file", str(kept))])).results[0].successful
+    def new_map_begins() -> None:
+        begun = stages.nodes["tracking"].output.count("a new map begins")
+        stages.send_until(again(frames), lambda: stages.nodes["tracking"].output.count("a new map begins") > begun, "a new map")
+
+    (keeper,) = children(stages.nodes["mapping"].process.pid)  # it has the map: a new one begins
+    os.kill(keeper, signal.SIGKILL)
+    new_map_begins()
+    assert "killed; out of memory?" in stages.nodes["mapping"].output
+    stages.restart("mapping", camera)
+    new_map_begins()
+    assert graph.call(SetParameters, "mapping/set_parameters", set_map_file).results[0].successful
     answer = graph.call(Trigger, "mapping/load_map", Trigger.Request())
     assert answer.success, answer.message
-    resent = iter(again(frames[14:22] * 5))
-    while len(graph.received["pose"]) < before + 3:
-        graph.send([next(resent)])
-        graph.spin_for(1.0)
+    poses_come(frames[14:22], 3, "poses in the map that was loaded")
     assert graph.call(SetBool, "tracking/localization_only", SetBool.Request(data=True)).success
     assert stages.end() == [0, 0, 0, 0]

@@ -34,6 +34,7 @@ def slam(
     only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Of the suite only this sequence; repeatable.")] = None,
     profile: Annotated[list[str] | None, typer.Option(help="paper, quality, fast or realtime; repeatable. Default: quality; with --suite all.")] = None,
     runs: Annotated[int, typer.Option(min=1, metavar="N", help="Runs of each, with seeds 0 to N-1.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, metavar="N", help="Runs at a time; times are then those of a shared machine.")] = 1,
     cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there; their time is then missing from s/frame.")] = None,
     max_frames: Annotated[list[str] | None, typer.Option("--max-frames", metavar="NAME=N", help="Use the first N frames of the recording of that name; repeatable.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the tables and every run's results. Default: runs/benchmark_TIME.")] = None,
@@ -65,6 +66,7 @@ def slam(
         cache=cache,
         max_frames=_limits(max_frames or []),
         assignments=tuple(set_ or ()),
+        workers=workers,
     )
     others = read_peers(peers) if peers is not None else None
     total = len(logic.planned_runs(plan))
@@ -187,6 +189,61 @@ def growth(
     for name, value in told.items():
         print(f"{name:18} {value}")
     print(f"figure             {folder / 'growth.png'}")
+
+
+@app.command("places")
+def places(
+    recordings: Annotated[list[Path] | None, typer.Argument(metavar="[INPUT...]", help="Recordings as `thegra run` takes them, each of a scene of its own.")] = None,
+    suite: Annotated[bool, typer.Option("--suite", help="Also the fixed simulated suite; what is missing of it is made first.")] = False,
+    suite_dir: Annotated[Path, typer.Option(metavar="DIR", help="Where the suite is kept.")] = Path("runs/suite"),
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Of the suite only this sequence; repeatable.")] = None,
+    check: Annotated[list[str] | None, typer.Option(metavar="CHECK", help="pairs: two recordings joined; back: one and its way back; between: one, another, and the first one's way back; kidnapped: a map of each, shown frames of its own and of all others. Repeatable. Default: all.")] = None,
+    profile: Annotated[str, typer.Option(help="paper, quality, fast or realtime.")] = "quality",
+    every: Annotated[int, typer.Option(min=1, metavar="N", help="Use every N-th frame.")] = 1,
+    max_frames: Annotated[int | None, typer.Option("--max-frames", min=2, metavar="N", help="Frames of each recording at the most.")] = None,
+    trials: Annotated[int, typer.Option(min=1, metavar="N", help="Times that the camera is set down in its own map.")] = 20,
+    shown: Annotated[int, typer.Option(min=1, metavar="N", help="Frames of each other recording that a map is shown.")] = 20,
+    gap: Annotated[float, typer.Option(min=0.0, metavar="S", help="Seconds without a frame between the recordings.")] = 0.0,
+    cache: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the networks' results there.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for results.json, results.md and thegra.log. Default: runs/places_TIME.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter for all runs; repeatable. `thegra config` lists them.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print results.json instead of the table.")] = False,
+) -> None:
+    """Tell whether places are told apart and found again: in joined recordings, and by a camera that is set down somewhere.
+
+    Example: `thegra benchmark places --suite --profile fast --every 2 --cache runs/cache`
+
+    Exit code: 0 all right, 1 some place was taken for another or not found again, 2 wrong use.
+    """
+    import logging
+
+    from rich.console import Console
+
+    from thegra_core.cli.run import cached_front_end, log_file
+    from thegra_core.config import load_config, parse_assignments
+    from thegra_core.evaluation.benchmark import places as logic
+    from thegra_core.evaluation.benchmark.settings import Settings
+    from thegra_core.process import set_threads
+    from thegra_core.sources.joined import read_clip
+
+    config = load_config(profile, overrides=parse_assignments(set_ or ()))
+    set_threads(config.threads)
+    plan = logic.Plan(tuple(check or logic.CHECKS), gap, trials, shown, tuple(set_ or ()))
+    paths = [*(recordings or ()), *(_suite(suite_dir, only) if suite else [])]
+    if not paths:
+        raise InputError("nothing to join: name recordings, or add --suite for the simulated ones")
+    target = out or Path("runs") / f"places_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"
+    with Console(stderr=True).status("reading") as status, log_file(target):
+        clips = {clip.name: clip for clip in (read_clip(path, every, max_frames) for path in paths)}
+
+        def say(what: str) -> None:
+            status.update(what)
+            logging.getLogger(__name__).info("%s", what)
+
+        content = logic.benchmark(clips, plan, Settings(config, *cached_front_end(config, cache)), target, say)
+    print(json.dumps(content, indent=2, allow_nan=False) if as_json else logic.markdown(content))
+    if logic.wrong(content):
+        raise typer.Exit(SOME_FAILED)
 
 
 def _frames_of(recordings: Sequence[Path], count: int) -> list[ImageArray]:

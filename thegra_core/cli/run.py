@@ -113,10 +113,10 @@ def run_recording(options: RunOptions) -> int:
     groundtruth = _groundtruth(options, recording)
     viewer = make_viewer(options.viewer)
     out = options.out or Path("runs") / f"{recording.name}_{started:%Y%m%dT%H%M%SZ}"
-    with _log_file(out), make_progress(options.quiet, _expected_frames(options, recording)) as progress, _interrupts() as interrupted:
+    with log_file(out), make_progress(options.quiet, _expected_frames(options, recording)) as progress, _interrupts() as interrupted:
         for line in (f"thegra {VERSION}, profile {config.profile}, seed {config.seed}", f"input {recording.path}", f"arguments {shlex.join(sys.argv[1:])}", *recording.notes):
             _log.info("%s", line)
-        front_end = _cached_front_end(config, options.cache)
+        front_end = cached_front_end(config, options.cache)
         system = make_live_system(camera, config) if options.realtime else make_system(camera, config, *front_end)
         with closing(system):
             if options.map is not None:
@@ -177,7 +177,8 @@ def make_live_system(camera: CameraModel, config: ThegraConfig) -> System:
     return Slam(camera, config, beside=True)
 
 
-def _cached_front_end(config: ThegraConfig, folder: Path | None) -> tuple[()] | tuple[CachedExtractor, CachedMatcher]:
+def cached_front_end(config: ThegraConfig, folder: Path | None) -> tuple[()] | tuple[CachedExtractor, CachedMatcher]:
+    """Extractor and matcher of the configuration that keep their results in a folder; nothing without one."""
     if folder is None:
         return ()
     from thegra_core.features.cache import cached_extractor, cached_matcher
@@ -320,7 +321,12 @@ def _weights(config: ThegraConfig) -> dict[str, str]:
 
 
 @contextmanager
-def _log_file(out: Path) -> Iterator[None]:
+def log_file(out: Path) -> Iterator[None]:
+    """Write what the package logs to `out`/thegra.log.
+
+    Raises:
+        InputError: If it cannot be written.
+    """
     logger = logging.getLogger("thegra_core")
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -27,3 +27,10 @@ def resolve_device(name: str = "auto") -> torch.device:
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise ConfigError(f"device {name!r} is not there ({torch.cuda.device_count()} CUDA devices); use: --set extractor.device=cpu --set matcher.device=cpu")
     return device
+
+
+def accelerator_name() -> str | None:
+    """What `auto` computes on if not on the processor, as the driver calls it."""
+    import torch
+
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else None

@@ -131,24 +131,31 @@ class CameraModel:
             theta_d = theta * (1 + t2 * (d[0] + t2 * (d[1] + t2 * (d[2] + t2 * d[3]))))
             scale = np.divide(theta_d, r, out=np.ones_like(r), where=r > 1e-12)
             return np.asarray(p * scale[:, None])
+        return self._distort_lens(p)[0]
+
+    def _distort_lens(self, p: FloatArray) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray]]:
+        """The pinhole models: distorted coordinates (N, 2) and the entries xx, xy = yx and yy, each (N,), of their derivative by the undistorted."""
+        d = self.distortion
         x, y = p[:, 0], p[:, 1]
+        x2, y2, xy = x * x, y * y, x * y
+        r2 = x2 + y2
         radial = 1 + r2 * (d[0] + r2 * (d[1] + r2 * d[4]))
+        slope = d[0] + r2 * (2 * d[1] + r2 * 3 * d[4])  # by r2
         if self.model is DistortionModel.RATIONAL_POLYNOMIAL:
-            radial = radial / (1 + r2 * (d[5] + r2 * (d[6] + r2 * d[7])))
-        return np.stack([x * radial + 2 * d[2] * x * y + d[3] * (r2 + 2 * x * x), y * radial + d[2] * (r2 + 2 * y * y) + 2 * d[3] * x * y], axis=1)
+            below = 1 + r2 * (d[5] + r2 * (d[6] + r2 * d[7]))
+            radial = radial / below
+            slope = (slope - radial * (d[5] + r2 * (2 * d[6] + r2 * 3 * d[7]))) / below
+        distorted = np.stack([x * radial + 2 * d[2] * xy + d[3] * (r2 + 2 * x2), y * radial + d[2] * (r2 + 2 * y2) + 2 * d[3] * xy], axis=1)
+        across = 2 * (slope * xy + d[2] * x + d[3] * y)
+        return distorted, (radial + 2 * slope * x2 + 2 * d[2] * y + 6 * d[3] * x, across, radial + 2 * slope * y2 + 6 * d[2] * y + 2 * d[3] * x)
 
     def _undistort_newton(self, target: FloatArray) -> FloatArray:
         p = target.copy()
-        step = np.full_like(p, np.inf)
-        h = 1e-6
-        along_x, along_y = np.array([h, 0.0]), np.array([0.0, h])
         for _ in range(_MAX_ITERATIONS):
-            residual = self._distort_normalized(p) - target
-            jx = (self._distort_normalized(p + along_x) - self._distort_normalized(p - along_x)) / (2 * h)
-            jy = (self._distort_normalized(p + along_y) - self._distort_normalized(p - along_y)) / (2 * h)
-            det = jx[:, 0] * jy[:, 1] - jy[:, 0] * jx[:, 1]
+            distorted, (xx, xy, yy) = self._distort_lens(p)
+            residual = distorted - target
             with np.errstate(divide="ignore", invalid="ignore"):
-                step = np.stack([jy[:, 1] * residual[:, 0] - jy[:, 0] * residual[:, 1], jx[:, 0] * residual[:, 1] - jx[:, 1] * residual[:, 0]], axis=1) / det[:, None]
+                step = np.stack([yy * residual[:, 0] - xy * residual[:, 1], xx * residual[:, 1] - xy * residual[:, 0]], axis=1) / (xx * yy - xy * xy)[:, None]
             # a damped step keeps strongly distorted corners from jumping over the radius where the model turns back
             length = np.linalg.norm(step, axis=1, keepdims=True)
             with np.errstate(divide="ignore", invalid="ignore"):

@@ -92,13 +92,16 @@ def _join_anew(editor: MapEditor, landmarks: list[int], other: MapKeyframe, feat
     """Join landmarks with keypoints of `other`, each at the point that all its observations then agree on, where there is one."""
     pairs: list[tuple[int, int]] = []
     views, normalized, index = [], [], []
+    poses: dict[int, FloatArray] = {}
     for landmark, feature in zip(landmarks, features, strict=True):
         if landmark not in editor.observers or other.id in editor.observers[landmark]:
             continue
         observations = {**editor.observers.get(int(other.landmark_ids[feature]), {}), **editor.observers[landmark], other.id: feature}
         for keyframe_id, keypoint in observations.items():
             keyframe = editor.map.keyframes[keyframe_id]
-            views.append(keyframe.camera_from_world)
+            if keyframe_id not in poses:
+                poses[keyframe_id] = keyframe.camera_from_world
+            views.append(poses[keyframe_id])
             normalized.append(keyframe.normalized[keypoint])
             index.append(len(pairs))
         pairs.append((landmark, feature))

@@ -17,7 +17,7 @@ from thegra_core.mapping.chaining import MatchGraph
 from thegra_core.messages import NO_LANDMARK, Revisit
 from thegra_core.optimization.pose_graph import Edge, optimize_pose_graph
 from thegra_core.places.index import PlaceIndex
-from thegra_core.places.verification import Sighting, agree, more_than_drift, sight
+from thegra_core.places.verification import Sighting, agree, drift_of, sight
 
 logger = logging.getLogger(__name__)
 ESSENTIAL_NEIGHBOURS = 5
@@ -59,10 +59,10 @@ class LoopCloser:
             near = [i for i in current.neighbours(candidate, len(current.keyframes)) if i not in connected]
             found = sight(current, keyframe_id, current, [candidate, *near[: self.config.loop.group - 1]], self.matcher, self.config)
             if isinstance(found, Sighting):
-                excess = more_than_drift(current, found, self.config.loop)
-                if not excess:
+                drift = drift_of(current, found)
+                if drift.is_possible(self.config.loop):
                     return found
-                found = excess
+                found = f"{len(found.keypoints)} landmarks agree, {found.visible} should be seen from there, but would {drift}"
             logger.info("keyframe %d looks like %d: %s", keyframe_id, candidate, found)
         return None
 
@@ -70,6 +70,7 @@ class LoopCloser:
 def _close(editor: MapEditor, sightings: list[Sighting], graph: MatchGraph, config: ThegraConfig) -> None:
     current = editor.map
     before = {i: Similarity(keyframe.world_from_camera) for i, keyframe in current.keyframes.items()}
+    drift = drift_of(current, sightings[-1])
     depth = current.median_depth(sightings[-1].keyframe_id)
     after = optimize_pose_graph(before, _edges(editor, before, sightings), min(before), depth)
     _move(editor, before, after)
@@ -87,8 +88,8 @@ def _close(editor: MapEditor, sightings: list[Sighting], graph: MatchGraph, conf
     keyframe, old_id, scale = current.keyframes[last.keyframe_id], next(iter(last.matches)), last.world_from_camera.scale
     editor.note(Revisit(keyframe.stamp_ns, current.map_id, keyframe.id, old_id, len(last.keypoints), moved, scale))
     logger.info(
-        "loop closed: keyframe %d sees what keyframe %d saw, by %d landmarks; it moves by %.3f of the scene's depth, scale %.3f",
-        keyframe.id, old_id, len(last.keypoints), moved, scale,
+        "loop closed: keyframe %d sees what keyframe %d saw, by %d landmarks of %d that should be seen from there, which %s; it moves by %.3f of the scene's depth, scale %.3f",
+        keyframe.id, old_id, len(last.keypoints), last.visible, drift, moved, scale,
     )  # fmt: skip
 
 

@@ -71,5 +71,5 @@ def merge(old: MapEditor, new: MapEditor, tie: Tie, config: ThegraConfig) -> dic
     last, (theirs, ours) = tie.sightings[-1], (new.map.map_id, old.map.map_id)
     stamp_ns = old.map.keyframes[last.keyframe_id].stamp_ns
     old.note(Revisit(stamp_ns, ours, last.keyframe_id, next(iter(last.matches)), len(last.keypoints), 0.0, old_from_new.scale, theirs))
-    logger.info("map %d is part of map %d: keyframe %d sees the same by %d landmarks", theirs, ours, last.keyframe_id, len(last.keypoints))
+    logger.info("map %d is part of map %d: keyframe %d sees the same by %d landmarks of %d that should be seen", theirs, ours, last.keyframe_id, len(last.keypoints), last.visible)
     return renamed

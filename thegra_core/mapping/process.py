@@ -1,7 +1,7 @@
 """Mapping in a process of its own, so that tracking never waits for it: bundle adjustment holds Python's global lock for a whole solve.
 
 One connection carries pickled messages both ways, in order. What tracking hands over is written by a thread, for the process reads nothing while it
-solves. The process ends when the connection does.
+solves. The process ends when the connection does, and at once with the process that it belongs to.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from thegra_core.config import ThegraConfig
 from thegra_core.errors import MappingError, ThegraError
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry.camera import CameraModel
+from thegra_core.lifeline import Lifeline, end_with_parent
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.service import InlineMapping
@@ -57,10 +58,12 @@ class MappingProcess:
 
     def __init__(self, camera: CameraModel, config: ThegraConfig, make_matcher: MakeMatcher, *, timely: bool = True) -> None:
         ours, theirs = socket.socketpair()
+        self._lifeline = Lifeline()
         with theirs:
-            command = [sys.executable, "-c", _LAUNCH, str(theirs.fileno())]
+            command = [sys.executable, "-c", _LAUNCH, str(theirs.fileno()), str(self._lifeline.fd)]
             environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno()], env=environment)
+            self._process = subprocess.Popen(command, pass_fds=[theirs.fileno(), self._lifeline.fd], env=environment)
+        self._lifeline.handed_over()
         self._connection = Connection(ours.detach())
         self._outbox: queue.SimpleQueue[tuple[str, tuple[Any, ...]] | None] = queue.SimpleQueue()
         self._writer = threading.Thread(target=self._write, name="thegra mapping writer", daemon=True)
@@ -68,7 +71,18 @@ class MappingProcess:
         self._updates: list[MapUpdate] = []
         self._submitted: deque[Future[Any]] = deque()
         self._undone = 0
-        self._tell("begin", camera, config, make_matcher, timely)
+        self._tell("equip", config, make_matcher, timely)
+        self._tell("begin", camera)
+
+    def begin(self, camera: CameraModel) -> None:
+        """Forget all maps, for another stream or camera: a new process would load everything again. Waits for what is in work.
+
+        Raises:
+            MappingError: If mapping has ended with an error.
+        """
+        self._tell("begin", camera)
+        self._ask("usage")
+        self._updates.clear()
 
     def initialize(self, initial: InitialMap) -> None:
         """See `MappingService.initialize`."""
@@ -158,6 +172,7 @@ class MappingProcess:
             self._process.wait()
         self._writer.join()
         self._connection.close()
+        self._lifeline.cut()
 
     # ---- steps ----------------------------------------------------------------------------------------------------------------------
 
@@ -247,6 +262,9 @@ def serve(connection: Connection) -> None:
     """Do what comes over the connection, in order, until it ends."""
     inbox = _Inbox(connection)
     mapping: InlineMapping | None = None
+    config: ThegraConfig
+    matcher: Matcher
+    timely = True
     others_wait = _never
     while True:
         try:
@@ -254,10 +272,16 @@ def serve(connection: Connection) -> None:
         except (EOFError, OSError):
             return
         try:
+            if name == "equip":
+                config, make_matcher, timely = arguments
+                matcher, others_wait = make_matcher(config), inbox.work_waits if timely else _never
+                continue
             if name == "begin":
-                camera, config, make_matcher, timely = arguments
-                mapping = InlineMapping(Mapper(camera, config, make_matcher(config), ProcessSolver() if timely else None))
-                others_wait = inbox.work_waits if timely else _never
+                if mapping is not None:
+                    for known in mapping.maps():  # also what is solved for them elsewhere
+                        mapping.drop(known.map_id)
+                (camera,) = arguments
+                mapping = InlineMapping(Mapper(camera, config, matcher, ProcessSolver() if timely else None))
                 continue
             assert mapping is not None
             for answer in _do(mapping, name, arguments, others_wait):
@@ -297,7 +321,8 @@ def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...], others_wa
 
 
 def main() -> None:
-    """The process: its argument is the file descriptor of the connection."""
+    """The process: its arguments are the file descriptors of the connection and of the lifeline."""
+    end_with_parent(int(sys.argv[2]))
     os.nice(NICENESS)
     logging.basicConfig(level=logging.WARNING, format="[thegra mapping] %(levelname)s %(message)s")
     keep_freed_memory()

@@ -9,10 +9,11 @@ import poselib
 from numpy.typing import NDArray
 
 from thegra_core.geometry import poses, triangulation
+from thegra_core.optimization.gauss_newton import minimize_reprojection
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-ROUNDS, STEPS = 4, 10
+ROUNDS = 4
 RANSAC_THRESHOLD_PX = 4.0
 """Inlier threshold of a first pose: wide, since the map's points carry their own error; refinement gates at the chi-square limit."""
 GROSS = 16.0
@@ -50,24 +51,22 @@ def refine_pose(
     focal: float,
     weights: FloatArray,
     chi2: float = 5.991,
-    least_step: float = 1e-8,
 ) -> PoseEstimate:
     """Least robust weighted reprojection error over one pose.
 
     Four rounds of at most ten Gauss-Newton steps; after each, observations beyond the gate sit out the next round, grossly wrong ones the first; the
     Huber kernel is off in the last.
     points_world (N, 3); normalized (N, 2) undistorted; focal in px turns their differences into pixels; weights (N,) 1/px^2; chi2
-    (px^2) limits squared pixel residuals, whatever the weights; a step below least_step (rad, map units) ends a round. Undefined (NaN) observations are
-    outliers.
+    (px^2) limits squared pixel residuals, whatever the weights. Undefined (NaN) observations are outliers.
     """
-    pose = camera_from_world
+    pose = np.ascontiguousarray(camera_from_world)
     start = (focal * triangulation.reprojection_errors(pose, points_world, normalized)) ** 2
     finite = start[np.isfinite(start)]
     inliers: BoolArray = start < GROSS * max(chi2, float(np.median(finite)) if len(finite) else np.inf)
     hessian = np.eye(6)
     for round_index in range(ROUNDS):
         robust = round_index < ROUNDS - 1
-        pose, hessian = _gauss_newton(pose, points_world[inliers], normalized[inliers], focal, weights[inliers], np.sqrt(chi2) if robust else np.inf, least_step)
+        pose, hessian = minimize_reprojection(pose, points_world[inliers], normalized[inliers], focal, weights[inliers], np.sqrt(chi2) if robust else np.inf)
         squared = (focal * triangulation.reprojection_errors(pose, points_world, normalized)) ** 2
         inliers = squared < chi2
         if inliers.sum() < 4:
@@ -77,30 +76,6 @@ def refine_pose(
     variance = float((weights[inliers] * squared).sum() / max(2 * count - 6, 1)) if count else 1.0
     covariance = np.asarray(max(variance, 1e-12) * np.linalg.pinv(hessian, hermitian=True), dtype=np.float64)
     return PoseEstimate(pose, inliers, covariance)
-
-
-def _gauss_newton(
-    pose: FloatArray, points_world: FloatArray, normalized: FloatArray, focal: float, weights: FloatArray, huber: float, least_step: float
-) -> tuple[FloatArray, FloatArray]:
-    hessian = np.eye(6)
-    for _ in range(STEPS):
-        points = poses.apply(pose, points_world)
-        front = points[:, 2] > 1e-9
-        if front.sum() < 3:
-            break
-        points = points[front]
-        residual = focal * (points[:, :2] / points[:, 2:] - normalized[front])
-        jacobian = focal * pose_jacobian(points)
-        length = np.sqrt(weights[front] * (residual**2).sum(axis=1))
-        w = weights[front] * np.minimum(1.0, huber / np.maximum(length, 1e-12))
-        weighted = jacobian * w[:, None, None]
-        hessian = np.einsum("nij,nik->jk", weighted, jacobian)
-        gradient = np.einsum("nij,ni->j", weighted, residual)
-        step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), gradient)
-        pose = poses.transform(poses.so3_exp(step[:3]), step[3:]) @ pose
-        if float(np.abs(step).max()) < least_step:
-            break
-    return pose, hessian
 
 
 def estimate_pose(points_world: FloatArray, normalized: FloatArray, focal: float, threshold_px: float, seed: int) -> tuple[FloatArray, int]:

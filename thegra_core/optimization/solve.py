@@ -1,4 +1,4 @@
-"""The process of `ProcessSolver`: a pickled task from standard input, its pickled result to standard output."""
+"""The process of `ProcessSolver`: a pickled task from standard input, its pickled result to standard output; its argument is the lifeline."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import signal
 import sys
 from contextlib import suppress
 
+from thegra_core.lifeline import end_with_parent
 from thegra_core.optimization.solver import BundleTask
 
 NICENESS = 10
@@ -16,6 +17,7 @@ NICENESS = 10
 
 def main() -> None:
     """Solve one task."""
+    end_with_parent(int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to the whole group; the caller decides
     os.nice(NICENESS)
     task = pickle.load(sys.stdin.buffer)

@@ -10,6 +10,7 @@ import threading
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from thegra_core.lifeline import Lifeline
 from thegra_core.optimization.bundle import BundleProblem, BundleResult, bundle_adjust
 
 logger = logging.getLogger(__name__)
@@ -62,7 +63,7 @@ class InlineSolver:
 
 @dataclass(frozen=True, slots=True)
 class ProcessSolver:
-    """Each task is solved by a process of its own, which ends with it.
+    """Each task is solved by a process of its own, which ends with it, or with the caller's.
 
     gtsam holds the interpreter's lock while it solves, so a thread would stop its caller all the same. A new interpreter rather than a fork or a child of
     `multiprocessing`: it works whatever threads the caller runs, and from within a daemon process, too.
@@ -94,12 +95,16 @@ class _InProcess:
 
     task: BundleTask
     _answer: BundleResult | None = None
+    _lifeline: Lifeline = field(init=False)
     _process: subprocess.Popen[bytes] = field(init=False)
     _thread: threading.Thread = field(init=False)
     _cancelled: bool = False
 
     def __post_init__(self) -> None:
-        self._process = subprocess.Popen([sys.executable, "-m", f"{__package__}.solve"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._lifeline = Lifeline()
+        command = [sys.executable, "-m", f"{__package__}.solve", str(self._lifeline.fd)]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=[self._lifeline.fd])
+        self._lifeline.handed_over()
         self._thread = threading.Thread(target=self._exchange, daemon=True, name="full adjustment")
         self._thread.start()
 
@@ -118,6 +123,7 @@ class _InProcess:
 
     def _exchange(self) -> None:
         output, _ = self._process.communicate(pickle.dumps(self.task, pickle.HIGHEST_PROTOCOL))
+        self._lifeline.cut()
         if self._process.returncode == 0:
             self._answer = pickle.loads(output)
         elif not self._cancelled:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from thegra_core.config import LoopConfig, ThegraConfig
+from thegra_core.config import LoopConfig, ThegraConfig, TrackingConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.geometry import poses
 from thegra_core.geometry.similarity import Similarity
@@ -26,7 +26,8 @@ IntArray = NDArray[np.int64]
 class Sighting:
     """A keyframe placed by an old part of its map: where it should be, (old units per new unit as scale), and by what.
 
-    keypoints (M,) of the keyframe see landmarks (M,) of the old place; matches maps the old keyframes to the matches with them.
+    keypoints (M,) of the keyframe see landmarks (M,) of the old place, of `visible` that should be seen from there; matches maps the old keyframes to the
+    matches with them.
     """
 
     keyframe_id: int
@@ -34,6 +35,23 @@ class Sighting:
     keypoints: IntArray
     landmarks: IntArray
     matches: Mapping[int, Matches]
+    visible: int
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """What a loop says has gone wrong on the way since the old place: degrees, distance over the length of the way, and the logarithm of the scale."""
+
+    turned_deg: float
+    moved_ratio: float
+    log_scale: float
+
+    def is_possible(self, config: LoopConfig) -> bool:
+        """Whether so much may drift. A drift of scale by itself moves what lies behind the camera, by half the way for each factor of e."""
+        return self.turned_deg <= config.max_drift_deg and self.moved_ratio <= config.max_drift_ratio + 0.5 * abs(self.log_scale)
+
+    def __str__(self) -> str:
+        return f"turn it by {self.turned_deg:.0f} degrees and move it by {self.moved_ratio:.2f} of the way since"
 
 
 def sight(new: Map, keyframe_id: int, old: Map, group: list[int], matcher: Matcher, config: ThegraConfig) -> Sighting | str:
@@ -62,20 +80,19 @@ def sight(new: Map, keyframe_id: int, old: Map, group: list[int], matcher: Match
     keypoints, landmarks, points = keypoints[estimate.inliers], landmarks[estimate.inliers], points[estimate.inliers]
     if len(keypoints) < settings.min_inliers:
         return f"{len(keypoints)} landmarks agree with one pose"
-    visible = _visible(old, list(matched), estimate.camera_from_world, config)
+    visible = len(should_be_seen(old, list(matched), estimate.camera_from_world, config.tracking))
     if len(keypoints) < settings.min_visible_share * visible:
         return f"{len(keypoints)} landmarks agree with one pose, {visible} should be seen from there"
     scale = _scale(new, keyframe, keypoints, poses.apply(estimate.camera_from_world, points)[:, 2], config)
     if isinstance(scale, str):
         return scale
-    return Sighting(keyframe_id, Similarity(poses.inverse(estimate.camera_from_world), scale), keypoints, landmarks, matched)
+    return Sighting(keyframe_id, Similarity(poses.inverse(estimate.camera_from_world), scale), keypoints, landmarks, matched, visible)
 
 
-def more_than_drift(current: Map, sighting: Sighting, config: LoopConfig) -> str:
-    """How a sighting of the same map moves its keyframe by more than what may have drifted on the way since the old place; empty if it does not.
+def drift_of(current: Map, sighting: Sighting) -> Drift:
+    """By how much a sighting of the same map corrects its keyframe.
 
-    Buildings repeat themselves: what looks alike at another place asks for a correction as large as the way between the two. A drift of scale by itself
-    moves what lies behind the camera, by half the way for each factor of e.
+    Buildings repeat themselves: what looks alike at another place asks for a correction as large as the way between the two.
     """
     estimated = Similarity(current.keyframes[sighting.keyframe_id].world_from_camera)
     correction = sighting.world_from_camera @ estimated.inverse()
@@ -84,10 +101,7 @@ def more_than_drift(current: Map, sighting: Sighting, config: LoopConfig) -> str
     centers = np.array([current.keyframes[i].center for i in sorted(current.keyframes) if first <= i <= last])
     way = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
     moved = float(np.linalg.norm(sighting.world_from_camera.rigid[:3, 3] - estimated.rigid[:3, 3]))
-    turned = np.degrees(poses.rotation_angle(correction.rigid[:3, :3]))
-    if turned <= config.max_drift_deg and moved <= (config.max_drift_ratio + 0.5 * abs(np.log(correction.scale))) * way:
-        return ""
-    return f"{len(sighting.keypoints)} landmarks agree, but would turn it by {turned:.0f} degrees and move it by {moved / max(way, 1e-9):.2f} of the way since"
+    return Drift(float(np.degrees(poses.rotation_angle(correction.rigid[:3, :3]))), moved / max(way, 1e-9), float(np.log(correction.scale)))
 
 
 def agree(new: Map, one: Sighting, other: Sighting, config: ThegraConfig) -> bool:
@@ -104,11 +118,11 @@ def agree(new: Map, one: Sighting, other: Sighting, config: ThegraConfig) -> boo
     )
 
 
-def _visible(old: Map, group: list[int], camera_from_world: NDArray[np.float64], config: ThegraConfig) -> int:
-    """How many of the landmarks that keyframes of the old place see a camera should see."""
-    ids = np.unique(np.concatenate([old.keyframes[i].landmark_ids for i in group]))
-    alive = ids[old.landmarks.rows(ids) >= 0]
-    return len(visible_landmarks(old.landmarks, alive, camera_from_world, old.camera, config.tracking).ids)
+def should_be_seen(place: Map, group: list[int], camera_from_world: NDArray[np.float64], config: TrackingConfig) -> IntArray:
+    """Ids (V,) of the landmarks that keyframes `group` of a place see and a camera there should see, too."""
+    ids = np.unique(np.concatenate([place.keyframes[i].landmark_ids for i in group]))
+    alive = ids[place.landmarks.rows(ids) >= 0]
+    return visible_landmarks(place.landmarks, alive, camera_from_world, place.camera, config).ids
 
 
 def _scale(new: Map, keyframe: MapKeyframe, keypoints: IntArray, old_depth: NDArray[np.float64], config: ThegraConfig) -> float | str:

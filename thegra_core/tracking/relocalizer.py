@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
+
+import numpy as np
 
 from thegra_core.config import ThegraConfig
 from thegra_core.features.protocols import Matcher
 from thegra_core.map.map import Map
 from thegra_core.messages import Features, Matches
 from thegra_core.places.index import PlaceIndex
+from thegra_core.places.verification import should_be_seen
 from thegra_core.tracking.tracker import Localization, best_reference, localize
+
+logger = logging.getLogger(__name__)
 
 
 def relocalize(
-    current: Map, features: Features, candidates: list[int], matcher: Matcher, config: ThegraConfig, min_inliers: int, known: Mapping[int, Matches] | None = None
+    current: Map, features: Features, candidates: list[int], matcher: Matcher, config: ThegraConfig, nearby: bool, known: Mapping[int, Matches] | None = None
 ) -> tuple[Localization, int, Matches] | None:
     """Place the frame by its matches to all candidate keyframes together; also the keyframe that shares most with it and the matches to that one.
 
     One keyframe alone may share too little with a frame that comes back after a gap; what several share adds up. `known` matches are not made again.
+    nearby: the camera was at these keyframes just now, and a pose that tracking would take will do. A camera that may be anywhere sees much that looks alike,
+    such as the cars and windows of another street: see `doubt_of`.
     """
     matched = dict(known or {})
     open_ids = [i for i in candidates if i not in matched]
@@ -26,10 +34,29 @@ def relocalize(
         return None
     reference_id = max(matched, key=lambda i: (len(matched[i]), i))
     found = localize(current, features, reference_id, matched, None, config)
-    if isinstance(found, str) or found.inliers < min_inliers:
+    if isinstance(found, str) or found.inliers < config.tracking.min_inliers:
         return None
     reference_id = best_reference(current, found.landmark_ids, list(matched))
+    doubt = "" if nearby else doubt_of(current, found, reference_id, config)
+    if doubt:
+        logger.info("the frame at %.3f s looks like keyframe %d: %s", features.stamp_ns / 1e9, reference_id, doubt)
+        return None
     return found, reference_id, matched[reference_id]
+
+
+def doubt_of(current: Map, found: Localization, reference_id: int, config: ThegraConfig) -> str:
+    """Why a pose of a camera that may be anywhere is not believed, by the keyframe that shares most with it; empty if it is."""
+    settings = config.relocalization
+    agreeing, visible = evidence(current, found, reference_id, config)
+    if found.inliers < settings.min_inliers:
+        return f"{found.inliers} landmarks agree with one pose"
+    return f"{agreeing} landmarks agree with one pose, {visible} should be seen from there" if agreeing < settings.min_visible_share * visible else ""
+
+
+def evidence(current: Map, found: Localization, reference_id: int, config: ThegraConfig) -> tuple[int, int]:
+    """How many of a keyframe's landmarks a frame sees, and how many it should see from its pose."""
+    visible = should_be_seen(current, [reference_id], found.camera_from_world, config.tracking)
+    return int(np.isin(visible, found.landmark_ids).sum()), len(visible)
 
 
 def last_keyframes(current: Map, reference_id: int, count: int) -> list[int]:

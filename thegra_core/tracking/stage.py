@@ -34,7 +34,7 @@ from thegra_core.tracking.followed import NotPlaced, TrackLandmarks, localize_fo
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
 from thegra_core.tracking.motion import MotionModel
-from thegra_core.tracking.relocalizer import last_keyframes, nearest_in_time, relocalize, similar_keyframes
+from thegra_core.tracking.relocalizer import doubt_of, evidence, last_keyframes, nearest_in_time, relocalize, similar_keyframes
 from thegra_core.tracking.tracker import FrameView, Localization, best_reference, localize
 
 FloatArray = NDArray[np.float64]
@@ -195,6 +195,8 @@ class TrackingStage:
         if matches is None or matches.reference_stamp_ns != place.reference.stamp_ns:
             matches = self._matcher.match(features, place.reference)
         found = localize(place.map, features, place.reference_id, {place.reference_id: matches}, place.predict(features.stamp_ns), self._config)
+        if place.lost_frames and not isinstance(found, str):
+            found = doubt_of(place.map, found, place.reference_id, self._config) or found
         if isinstance(found, str):
             return self._recover(place, features, matches, found, turned)
         return self._accept(place, features, found, matches)
@@ -314,7 +316,7 @@ class TrackingStage:
             if features.stamp_ns in keyframe_stamps:
                 continue
             candidates = self._place.places.query(features, 2) if self._place.resumed else nearest_in_time(current, features.stamp_ns, 2)
-            found = relocalize(current, features, candidates, self._matcher, self._config, self._config.relocalization.min_inliers)
+            found = relocalize(current, features, candidates, self._matcher, self._config, nearby=False)
             if found is not None:
                 relative = current.keyframes[found[1]].camera_from_world @ found[0].world_from_camera
                 placed.append(LateLocalization(features.stamp_ns, current.map_id, found[1], relative))
@@ -372,6 +374,8 @@ class TrackingStage:
 
     def _accept(self, place: _Place, features: Features, found: Localization, matches: Matches) -> TrackingOutput:
         if place.lost_frames:
+            told = "found again at %.3f s in map %d after %d frames: %d landmarks of the most similar keyframe agree, %d should be seen from there"
+            logger.info(told, features.stamp_ns / 1e9, place.map.map_id, place.lost_frames, *evidence(place.map, found, place.reference_id, self._config))
             place.lost_frames = 0
             self.relocalizations += 1
             place.motion.reset()
@@ -465,14 +469,14 @@ class TrackingStage:
     def _seek(self, place: _Place, features: Features, matches: Matches) -> tuple[Localization, int, Matches] | None:
         """Match a frame to the last keyframes or, once it is lost, to those that look most alike; `matches` are to the reference."""
         settings = self._config.relocalization
-        if place.lost_frames == 0:
+        nearby = place.lost_frames == 0
+        if nearby:
             candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
         else:
             candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
-        least = self._config.tracking.min_inliers if place.lost_frames == 0 else settings.min_inliers
         if self._thorough is not None:
-            return relocalize(place.map, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, self._config, least)
-        return relocalize(place.map, features, candidates, self._matcher, self._config, least, {place.reference_id: matches})
+            return relocalize(place.map, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, self._config, nearby)
+        return relocalize(place.map, features, candidates, self._matcher, self._config, nearby, {place.reference_id: matches})
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:

@@ -52,12 +52,11 @@ class FrameView:
         self.defined = np.asarray(np.isfinite(self.normalized).all(axis=1))
         self.weights = observation_weights(features.scores, config.weighting)
         self.focal = camera.focal
-        self._least_step = config.tracking.least_step
 
     def refine(self, camera_from_world: FloatArray, points_world: FloatArray, keypoints: IntArray, chi2_px2: float) -> PoseEstimate:
         """Motion-only bundle adjustment on points (M, 3) seen by keypoints (M,)."""
         return refine_pose(
-            camera_from_world, points_world, self.normalized[keypoints], self.focal, self.weights[keypoints], chi2_px2, self._least_step
+            camera_from_world, points_world, self.normalized[keypoints], self.focal, self.weights[keypoints], chi2_px2
         )
 
 

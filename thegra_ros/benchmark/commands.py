@@ -26,7 +26,7 @@ LIGHT = ("extractor.name=orb", "preprocessing.filters=[{filter: he_clip}]", "loo
 SIMULATED_S, SIMULATED_HZ = 8.0, 10.0
 
 InputArgument = Annotated[Path | None, typer.Argument(metavar="[INPUT]", help="A recording. Default: a simulated 640x512 room.")]
-ProfileOption = Annotated[str, typer.Option(help="paper, quality or fast.")]
+ProfileOption = Annotated[str, typer.Option(help="paper, quality, fast or realtime.")]
 SetOption = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter; repeatable. Default: ORB and one light filter.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 

@@ -28,7 +28,7 @@ from thegra_ros.qos import RELIABLE
 
 GRAPHS = {"one process": ("slam",), "four processes": ("preprocessing", "frontend", "tracking", "mapping")}
 TARGETS_MS = {"one process": 5.0, "four processes": 12.0}
-BETWEEN_STAGES = ("image_preprocessed", "shutter", "features", "matches", "reference", "keyframe", "map_update")
+BETWEEN_STAGES = ("image_preprocessed", "shutter", "features", "matches", "wanted", "reference", "keyframe", "map_update")
 DISCOVERY_LIMIT_S, SETTLE_S, LAST_POSE_S = 60.0, 2.0, 5.0
 
 

@@ -70,9 +70,11 @@ def word(facts: Mapping[str, str]) -> Table:
 
 
 def features_table(features: Features) -> Table:
-    """x, y, score, descriptor of every keypoint."""
+    """x, y, score, descriptor of every keypoint, and the number of its track where there are tracks."""
     width, height = features.image_size
     columns = {"x": features.keypoints[:, 0], "y": features.keypoints[:, 1], "score": features.scores, "descriptor": features.descriptors}
+    if features.track_ids is not None:
+        columns["track"] = features.track_ids
     return Table(columns, {"stamp_ns": str(features.stamp_ns), "extractor": features.extractor, "image_size": f"{width}x{height}", "turns": str(features.turns)})
 
 
@@ -81,7 +83,10 @@ def table_features(table: Table) -> Features:
     columns = table.columns
     width, height = table.facts["image_size"].split("x")
     keypoints = np.stack([columns["x"], columns["y"]], axis=1)
-    return Features(int(table.facts["stamp_ns"]), keypoints, columns["score"], columns["descriptor"], (int(width), int(height)), table.facts["extractor"], turns=int(table.facts["turns"]))
+    return Features(
+        int(table.facts["stamp_ns"]), keypoints, columns["score"], columns["descriptor"], (int(width), int(height)), table.facts["extractor"],
+        _ids(table, "track") if "track" in columns else None, int(table.facts["turns"]),
+    )  # fmt: skip
 
 
 def matches_table(matches: Matches) -> Table:

@@ -59,7 +59,7 @@ class SlamNode(ManagedNode):
         self._place, self._epoch = CameraPlace(self, self._own), 0
         self._map_sent_ns, self._map_id, self._ms, self._age_ms = 0, -1, 0.0, 0.0
         self._health = Health()
-        self._reporter = Reporter(self, self._health, self._facts)
+        self._reporter = Reporter(self, self._health, self._facts, self._own.diagnostics_period_s)
         self._camera = CameraInput(self, self._own.camera_file, self._health, self._begin_anew)
         self._poses, self._map, self._tracks = PoseOutputs(self, self._place.frames, self._own), MapOutputs(self), TracksOutput(self)
         self._images = ImageInput(self, self._own.image_transport, self._health, self._on_frame, self._on_restart)
@@ -198,7 +198,7 @@ class SlamNode(ManagedNode):
         dropped = self._worker.queue.dropped if self._worker is not None else 0
         return {
             "dropped": dropped, "state": self._health.state.value, "map": self._map_id, "map grows": "no" if self._localizing else "yes", "ms a frame": f"{self._ms:.0f}", "image to pose ms": f"{self._age_ms:.0f}",
-            "camera": "known" if self._camera.camera is not None else "unknown", "scale": f"{self._own.scale:g} m a map unit" if self._own.scale != 1.0 else "unknown",
+            "camera": self._camera.described, "scale": f"{self._own.scale:g} m a map unit" if self._own.scale != 1.0 else "unknown",
         }  # fmt: skip
 
 

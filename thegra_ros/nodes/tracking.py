@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import queue
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from enum import Enum
 from typing import Any
 
@@ -19,26 +21,32 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from thegra_core.errors import InputError
-from thegra_core.features.registry import make_matcher
+from thegra_core.features.nearest import Nearest
+from thegra_core.features.protocols import Wanted
+from thegra_core.features.registry import make_frame_matcher, make_matcher
+from thegra_core.features.tracks import TrackMatcher
+from thegra_core.features.turning import TurningMatcher
 from thegra_core.geometry.camera import CameraModel
-from thegra_core.messages import Shutter, TrackingResult, TrackingState
+from thegra_core.messages import Matches, Shutter, TrackingResult, TrackingState
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
 from thegra_ros.camera_input import CameraInput
 from thegra_ros.camera_place import CameraPlace
 from thegra_ros.codec.clouds import Table, cloud_table
 from thegra_ros.codec.poses import odometry
 from thegra_ros.codec.records import Assembler, initial_map_tables, keyframe_tables, record_clouds, table_features, table_matches, tables_update, word
+from thegra_ros.codec.rounds import SecondRound, is_followed, verdict_message
 from thegra_ros.codec.shutter import FrameNotice, read_notice
 from thegra_ros.codec.stamps import header, stamp_ns
 from thegra_ros.joiner import FrameJoiner
 from thegra_ros.lifecycle import run_node
 from thegra_ros.outputs import PoseOutputs
 from thegra_ros.qos import LATCHED, LOSSLESS
-from thegra_ros.stage_node import StageNode
+from thegra_ros.stage_node import EVERYTHING, StageNode
 from thegra_ros.transforms import stamped_pose
 
 PATIENCE_S = 5.0
-"""After so long a wait for mapping it is said that it does not answer."""
+"""After so long a wait for mapping it is said that it does not answer; a frame that frontend does not answer for is placed by what there is."""
+WAKE_S = 0.2
 
 
 class Beginning(Enum):
@@ -71,14 +79,26 @@ class TrackingNode(StageNode):
         self._camera = CameraInput(self, self.own.camera_file, self.health, lambda why: self._want(Beginning.FRESH, why))
         self._joiner = FrameJoiner("notice", lambda parts: {"features", "matches"} <= set(parts) or _closed(parts), _closed)
         self.listen(DiagnosticArray, "shutter", LOSSLESS, lambda m: self._join("notice", stamp_ns(m), read_notice(m)))
-        self.listen(PointCloud2, "features", LOSSLESS, lambda m: self._join("features", stamp_ns(m), table_features(cloud_table(m))))
-        self.listen(PointCloud2, "matches", LOSSLESS, lambda m: self._join("matches", stamp_ns(m), table_matches(cloud_table(m))))
+        self._second, self._seconds = SecondRound(), queue.SimpleQueue[Mapping[str, Any]]()
+        self._verdicts = self.publisher(Header, "wanted", LOSSLESS)
+        self.listen(PointCloud2, "features", LOSSLESS, lambda m: self._on_part("features", cloud_table(m), table_features))
+        self.listen(PointCloud2, "matches", LOSSLESS, lambda m: self._on_part("matches", cloud_table(m), table_matches))
         self.listen(PointCloud2, "map_update", LOSSLESS, self._on_update)
 
     def load(self) -> None:
-        self._matcher = make_matcher(self.config.matcher, self.config.extractor)
+        learned = make_matcher(self.config.matcher, self.config.extractor)
+        quick = Nearest(self.config.matcher) if self.config.tracking.match_by == "nearest" else None
+        self._matcher = make_frame_matcher(self.config, quick or learned)
+        self._thorough = TrackMatcher(TurningMatcher(learned), EVERYTHING) if quick is not None else None
 
     def work(self, item: Mapping[str, Any]) -> None:
+        self._unanswered = "followed" in item
+        try:
+            self._work(item)
+        finally:
+            self._answer(item["notice"].shutter.stamp_ns, None)  # frontend waits for a word of every frame that it followed
+
+    def _work(self, item: Mapping[str, Any]) -> None:
         notice: FrameNotice = item["notice"]
         camera = self._camera.camera
         if camera is None:
@@ -92,7 +112,7 @@ class TrackingNode(StageNode):
         if stage is None:
             return
         stage.localization_only = self._localizing
-        output = _track(stage, item, camera)
+        output = self._track(stage, item, camera)
         self._poses.publish(output.result, self._place.frames)  # mapping changes nothing of it: it need not wait
         self._tell_mapping(stage, output, notice)
         self._tell_frontend(stage)
@@ -105,7 +125,7 @@ class TrackingNode(StageNode):
         stage = self._stage
         return {
             "state": self.health.state.value, "lost parts": self._joiner.lost + self._assembler.broken, "map": stage.map_id if stage is not None else -1,
-            "map grows": "no" if self._localizing else "yes",
+            "map grows": "no" if self._localizing else "yes", "camera": self._camera.described,
         }  # fmt: skip
 
     # ---- the working thread ---------------------------------------------------------------------------------------------------------
@@ -128,7 +148,7 @@ class TrackingNode(StageNode):
             self._beginning = Beginning.RESUME
             self._told(TrackingResult(stamp, TrackingState.LOST, reason="only localisation is on, and mapping has no map: give it a map_file, or call ~/localization_only with false"))
             return None
-        self._stage = TrackingStage(camera, self.config, self._matcher)
+        self._stage = TrackingStage(camera, self.config, self._matcher, thorough=self._thorough)
         if kind == "resume":
             taken = tables[0].facts
             self._stage.resume(tables_update(tables[1:]), int(taken["next_map"]), int(taken["next_keyframe"]))
@@ -136,6 +156,42 @@ class TrackingNode(StageNode):
         else:
             self.get_logger().info("a new map begins")
         return self._stage
+
+    def _track(self, stage: TrackingStage, item: Mapping[str, Any], camera: CameraModel) -> TrackingOutput:
+        state = item["notice"].shutter
+        if state.shutter is Shutter.CLOSED:
+            return stage.hold(state.stamp_ns, state.reason)
+        if item["features"].image_size != camera.image_size:
+            return TrackingOutput(TrackingResult(state.stamp_ns, TrackingState.LOST, reason="image size differs from the camera's"))
+        if state.shutter is Shutter.JUST_OPENED:
+            stage.reopen()
+        if "followed" in item:
+            output = stage.process_followed(item["features"], _known(item["matches"]))
+            if isinstance(output, TrackingOutput):
+                self._answer(state.stamp_ns, None)
+                return output
+            item = self._second_round(state.stamp_ns, output) or item
+        return stage.process(item["features"], _known(item["matches"]))
+
+    def _second_round(self, stamp: int, wanted: Wanted) -> Mapping[str, Any] | None:
+        """Have frontend detect in the image; features and matches, or None where it does not answer."""
+        while not self._seconds.empty():  # what came too late
+            self._seconds.get()
+        self._second.expect(stamp)
+        self._answer(stamp, wanted)
+        end = time.monotonic() + PATIENCE_S
+        while not self.stopping.is_set() and time.monotonic() < end:
+            with suppress(queue.Empty):
+                return self._seconds.get(timeout=WAKE_S)
+            if self.queue is not None and len(self.queue):  # frontend has gone on to the next image
+                break
+        return None
+
+    def _answer(self, stamp: int, wanted: Wanted | None) -> None:
+        """Say, once, what is wanted of a frame that was followed."""
+        if self._unanswered and not self.stopping.is_set():
+            self._verdicts.publish(verdict_message(stamp, wanted))
+        self._unanswered = False
 
     def _tell_mapping(self, stage: TrackingStage, output: TrackingOutput, notice: FrameNotice) -> None:
         stamp = output.result.stamp_ns
@@ -185,6 +241,17 @@ class TrackingNode(StageNode):
 
     # ---- callbacks ------------------------------------------------------------------------------------------------------------------
 
+    def _on_part(self, part: str, table: Table, read: Callable[[Table], Any]) -> None:
+        value, followed = read(table), is_followed(table)
+        if followed:
+            self._join("followed", value.stamp_ns, True)
+        elif value.stamp_ns == self._second.stamp_ns:
+            both = self._second.add(part, value)
+            if both is not None:
+                self._seconds.put(both)
+            return
+        self._join(part, value.stamp_ns, value)
+
     def _join(self, part: str, stamp: int, value: Any) -> None:
         if not self.active:
             return
@@ -219,16 +286,9 @@ class TrackingNode(StageNode):
         self.get_logger().info(f"tracking begins again: {why}")
 
 
-def _track(stage: TrackingStage, item: Mapping[str, Any], camera: CameraModel) -> TrackingOutput:
-    state = item["notice"].shutter
-    if state.shutter is Shutter.CLOSED:
-        return stage.hold(state.stamp_ns, state.reason)
-    if item["features"].image_size != camera.image_size:
-        return TrackingOutput(TrackingResult(state.stamp_ns, TrackingState.LOST, reason="image size differs from the camera's"))
-    if state.shutter is Shutter.JUST_OPENED:
-        stage.reopen()
-    matches = item["matches"] if item["matches"].reference_stamp_ns else None
-    return stage.process(item["features"], matches)
+def _known(matches: Matches) -> Matches | None:
+    """None where frontend had no reference."""
+    return matches if matches.reference_stamp_ns else None
 
 
 def _closed(parts: Mapping[str, Any]) -> bool:

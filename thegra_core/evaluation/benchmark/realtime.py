@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from thegra_core.evaluation.benchmark.machine import described, machine
 from thegra_core.evaluation.benchmark.slam import Plan, PlannedRun, RunResult, execute, planned_runs, write_report
 from thegra_core.evaluation.suite import make_recording
 from thegra_core.simulation.simulate import SimulationOptions
@@ -62,12 +61,6 @@ def benchmark(
     return content
 
 
-def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"platform": platform.platform(), "python": platform.python_version(), "processors": cores}
-
-
 def failures(content: Mapping[str, Any]) -> list[str]:
     """One line for each run that failed."""
     return [line for result in content["results"] for line in result["failed"]]
@@ -81,7 +74,7 @@ def markdown(content: Mapping[str, Any]) -> str:
     told = (
         f"{settings}Latency: from the frame's delivery to its pose. Frame: the work on it. CPU: of all processes. Dropped frames count as not tracked. ATE: after Sim(3) "
         f"alignment, of the finished map; live: as estimated at the time. "
-        f"Thegra {content['version']}, {content['machine']['processors']} processors, {content['machine']['platform']}."
+        f"Thegra {content['version']}, {described(content['machine'])}."
     )
     return f"{text}\n{told}\n" + "".join(f"\nFailed: {line}\n" for line in failures(content))
 

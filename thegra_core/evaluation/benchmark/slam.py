@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import numpy as np
 
 from thegra_core.config import load_config, parse_assignments
 from thegra_core.errors import InputError
+from thegra_core.evaluation.benchmark.machine import machine
 from thegra_core.evaluation.benchmark.peers import best_peer, median_or_none
 from thegra_core.evaluation.scores import read_intervals, read_stamps
 from thegra_core.evaluation.tasks import RAN, run_process
@@ -39,7 +40,7 @@ class Plan:
     """What to run: every recording with every profile and the seeds 0 to runs - 1.
 
     max_frames maps a recording's name (that of its folder or file) to the frames it is cut to. assignments are `key=value` parameters. realtime: each
-    recording is played at its own rate.
+    recording is played at its own rate. workers: runs at a time.
     """
 
     recordings: tuple[Path, ...]
@@ -50,6 +51,7 @@ class Plan:
     max_frames: Mapping[str, int] = field(default_factory=dict)
     assignments: tuple[str, ...] = ()
     realtime: bool = False
+    workers: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,17 +106,30 @@ def planned_runs(plan: Plan) -> list[PlannedRun]:
 
 
 def run_plan(plan: Plan, before: Callable[[PlannedRun], None], after: Callable[[Sequence[RunResult]], None]) -> list[RunResult]:
-    """Run everything in order; `before` is told what starts, `after` all results so far each time one is there. A failed run stops nothing.
+    """Run everything; `before` is told what starts, in the thread that starts it, `after` all results so far, in order, each time one is there.
+
+    A failed run stops nothing.
 
     Raises:
         ThegraError: As `planned_runs`, before anything runs.
     """
-    results: list[RunResult] = []
-    for run in planned_runs(plan):
+    runs = planned_runs(plan)
+    results: dict[int, RunResult] = {}
+
+    def started(run: PlannedRun) -> RunResult:
         before(run)
-        results.append(execute(run, plan))
-        after(results)
-    return results
+        return execute(run, plan)
+
+    with ThreadPoolExecutor(plan.workers) as pool:
+        places = {pool.submit(started, run): i for i, run in enumerate(runs)}
+        try:
+            for done in as_completed(places):
+                results[places[done]] = done.result()
+                after([results[i] for i in sorted(results)])
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return [results[i] for i in range(len(runs))]
 
 
 def execute(run: PlannedRun, plan: Plan) -> RunResult:
@@ -122,7 +137,8 @@ def execute(run: PlannedRun, plan: Plan) -> RunResult:
     run.folder.mkdir(parents=True, exist_ok=True)
     for stale in (*run.folder.glob("*.json"), *run.folder.glob("*.txt")):
         stale.unlink()
-    code, said = run_process(command(run, plan))
+    threads = max(1, (os.cpu_count() or 1) // plan.workers) if plan.workers > 1 else 0
+    code, said = run_process(command(run, plan), threads)
     if code not in RAN or not (run.folder / "metrics.json").is_file():
         return RunResult(run, code, {}, said or f"exit code {code}")
     try:
@@ -234,8 +250,9 @@ def report(plan: Plan, results: Sequence[RunResult], peers: Mapping[str, Any] | 
         groups.setdefault((result.run.name, result.run.profile), []).append(result)
     return {
         "version": VERSION,
-        "machine": {"platform": platform.platform(), "python": platform.python_version(), "processors": os.cpu_count()},
+        "machine": machine(),
         "runs": plan.runs,
+        "workers": plan.workers,
         "assignments": list(plan.assignments),
         "results": [summarize(group) for group in groups.values()],
         "peers": {name: best_peer(peers.get(name, {})) for name in dict.fromkeys(name for name, _ in groups)} if peers is not None else {},

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from thegra_core.evaluation.benchmark.machine import described
 from thegra_core.evaluation.benchmark.peers import PEER_COVERAGE_PCT
 from thegra_core.outputs.scoring import MIN_COVERAGE_PCT
 
@@ -33,11 +34,12 @@ def caption(report: Mapping[str, Any]) -> str:
     seeds = f"Median of {runs} runs with seeds 0 to {runs - 1}, each in brackets. " if runs > 1 else "Seed 0. "
     settings = f"With {', '.join(report['assignments'])}. " if report["assignments"] else ""
     peers = f" Best peer: the lowest median ATE among systems and variants that track at least {PEER_COVERAGE_PCT:g} %." if report["peers"] else ""
+    shared = f" {report['workers']} runs at a time: times are those of a shared machine." if report["workers"] > 1 else ""
     return (
         f"{seeds}{settings}Tracked: frames of the main map outside shutter closures; ATE after Sim(3) alignment, in the reference's unit, and over its "
         f"spread (near 75 %: nothing was estimated) and the reference's path; no error where under {MIN_COVERAGE_PCT:g} % are tracked. Live: as estimated at the time. "
-        f"Recall: frames within 1 % of the path. Time: median / 95 % of the first run, without the final adjustment; memory: the most of any run (a run from the cache loads no network).{peers} "
-        f"Thegra {report['version']}, {report['machine']['processors']} processors, {report['machine']['platform']}."
+        f"Recall: frames within 1 % of the path. Time: median / 95 % of the first run, without the final adjustment; memory: the most of any run (a run from the cache loads no network).{peers}{shared} "
+        f"Thegra {report['version']}, {described(report['machine'])}."
     )
 
 
