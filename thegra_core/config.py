@@ -224,7 +224,7 @@ class FlowConfig(Section):
     min_share: float = Field(0.4, ge=0, le=1, description="the same, as a share of the points after the last detection")
     far_share: float = Field(0.5, ge=0, le=1, description="share of one frame's points found in the next below which they are sought with more effort: after missing frames, a closed shutter, a quick turn (video finds 0.8 to 0.95 at once, measured)")
     near_px: float = Field(4.0, gt=0, description="px around a followed point in which a detection is the same point")
-    min_shared: int = Field(50, ge=8, description="tracks that two frames must share for these to be their matches; learned matching where they share fewer")
+    min_shared: int = Field(50, ge=8, description="tracks that two frames must share for these to be all their matches; where they share fewer, those of the matcher are added")
 
 
 # ---- the method (paper Sec. III-C, III-D) -----------------------------------------------------------------------------------------

@@ -183,7 +183,9 @@ class Slam:
                 self._fixed_pattern.forget()
             if shutter.shutter is Shutter.JUST_OPENED:
                 self._tracking.reopen()
-            output = self._tracking.hold(frame.stamp_ns, shutter.reason) if shutter.shutter is Shutter.CLOSED else self._see(frame)
+            output = self._hold(frame, shutter) if shutter.shutter is Shutter.CLOSED else self._see(frame)
+            with self._timed("mapping"):
+                self._take_updates()
         self._stage_ms["total"] = 1e3 * (time.perf_counter() - begin)
         result = replace(output.result, stage_ms=dict(self._stage_ms))
         self._record(frame.index, result, output.provisional, bad=bool(trouble))
@@ -264,6 +266,11 @@ class Slam:
 
     # ---- steps ----------------------------------------------------------------------------------------------------------------------
 
+    def _hold(self, frame: Frame, shutter: ShutterState) -> TrackingOutput:
+        with self._timed("mapping"):
+            self._take_updates()
+        return self._tracking.hold(frame.stamp_ns, shutter.reason)
+
     def _see(self, frame: Frame) -> TrackingOutput:
         with self._timed("preprocessing"):
             image = self._chain(frame.image, frame.stamp_ns)
@@ -282,7 +289,6 @@ class Slam:
                 self._mapping.initialize(output.initial_map)
             elif output.keyframe is not None:
                 self._mapping.insert(output.keyframe)
-            self._take_updates()
         self._view = lambda: _snapshot(frame, image, features, output, reference)
         self._snapshots.offer(frame.index, self._view)
         return output

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from synthetic import CAMERA, FakeMatcher, World, cloud, loop, no_features, observe, room, sideways, stamp
@@ -12,7 +14,7 @@ from thegra_core.geometry.alignment import umeyama
 from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.map import Map
 from thegra_core.mapping.mapper import Mapper
-from thegra_core.messages import Features, Keyframe, MapUpdate, TrackingState
+from thegra_core.messages import Features, Keyframe, MapUpdate, Matches, TrackingState
 from thegra_core.optimization.solver import BundleSolver
 from thegra_core.tracking.motion import MotionModel
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
@@ -459,3 +461,25 @@ def test_a_place_seen_again_takes_the_drift_out() -> None:
             np.testing.assert_array_equal(replica.keyframes[i].world_from_camera, keyframe.world_from_camera)
             np.testing.assert_array_equal(replica.keyframes[i].landmark_ids, keyframe.landmark_ids)
     assert errors[True] < 0.6 * errors[False]
+
+
+class Sighted(FakeMatcher):
+    """Finds nothing while `blind`."""
+
+    blind = False
+
+    def match(self, query: Features, reference: Features) -> Matches:
+        found = super().match(query, reference)
+        return replace(found, indices=found.indices[:0], confidence=found.confidence[:0]) if self.blind else found
+
+
+@pytest.mark.parametrize("thorough", [None, FakeMatcher()])
+def test_a_frame_that_the_matcher_does_not_place_is_given_to_the_thorough_one(thorough: FakeMatcher | None) -> None:
+    world, path = cloud(count=600, seed=1, low=(-4, -3, 3), high=(8, 3, 8)), sideways(40, 0.05)
+    pair = Pair(matcher=(matcher := Sighted()))
+    pair.tracking = TrackingStage(CAMERA, CONFIG, matcher, thorough=thorough)
+    pair.run(world, path)
+    matcher.blind = True
+    away = path[28]  # too far from where it would be by now for its landmarks to be sought around their projections
+    state = pair.see(observe(world, away, stamp(40), 0.3, 0.9, 10)).result.state
+    assert state is (TrackingState.LOST if thorough is None else TrackingState.TRACKING)

@@ -69,6 +69,9 @@ def figures(recording: Path, out: Path, max_frames: int | None = None, profile: 
         ("paper", "sim_room_shutter", 97, 0.06),
         ("paper", "forest_f6_line1", 93, 0.3),
         ("paper", "forest_f0", 90, 0.3),
+        ("realtime", "kitchen_rgb_7scenes", 95, 0.045),
+        ("realtime", "sim_corridor_loop", 97, 0.25),
+        ("realtime", "sim_room_shutter", 60, 0.06),  # its second closure takes a second, in which half of the view leaves the image
     ],
 )
 def test_it_tracks(shared_data: Path, tmp_path: Path, profile: str, name: str, tracked_pct: float, ate_rmse: float) -> None:
@@ -109,16 +112,18 @@ def test_a_plane_from_above_is_tracked_or_left_alone(shared_data: Path, tmp_path
 
 @pytest.mark.slow
 @pytest.mark.timeout(PATIENCE_S)
+@pytest.mark.parametrize("profile", ["quality", "realtime"])
 @pytest.mark.parametrize("name", ["sim_rotation_only", "neg_hover_static_hit"])
-def test_a_camera_that_stays_in_place_starts_no_map(shared_data: Path, tmp_path: Path, name: str) -> None:
-    reached = figures(shared_data / name, tmp_path)
+def test_a_camera_that_stays_in_place_starts_no_map(shared_data: Path, tmp_path: Path, name: str, profile: str) -> None:
+    reached = figures(shared_data / name, tmp_path, profile=profile)
     assert (reached["maps"], reached["poses"]) == (0, 0)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(PATIENCE_S)
-def test_a_hovering_camera_that_pans_claims_no_journey(shared_data: Path, tmp_path: Path) -> None:
-    assert figures(shared_data / "neg_hover_pan_hit", tmp_path)["extent"] < SHORT
+@pytest.mark.parametrize("profile", ["quality", "realtime"])
+def test_a_hovering_camera_that_pans_claims_no_journey(shared_data: Path, tmp_path: Path, profile: str) -> None:
+    assert figures(shared_data / "neg_hover_pan_hit", tmp_path, profile=profile)["extent"] < SHORT
 
 
 @pytest.mark.slow
@@ -143,12 +148,13 @@ def test_a_long_corridor_closes_its_loop(tmp_path: Path) -> None:
     assert reached["ate_pct"] <= 0.3
 
 
-def test_same_input_same_bytes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("profile", ["fast", "realtime"])
+def test_same_input_same_bytes(tmp_path: Path, profile: str) -> None:
     bag = simulate(SimulationOptions(style="aggressive", duration_s=1.5, image_size=(320, 256)), tmp_path / "bag")
-    extractor = "orb" if missing_weights("fast") else "xfeat"
+    extractor = "orb" if missing_weights(profile) else "xfeat"
     outs = [tmp_path / "first", tmp_path / "second"]
     for out in outs:
-        command = ["run", bag, "--profile", "fast", "--set", f"extractor.name={extractor}", "--out", out, "--quiet"]
+        command = ["run", bag, "--profile", profile, "--set", f"extractor.name={extractor}", "--out", out, "--quiet"]
         subprocess.run([sys.executable, "-m", "thegra_core.cli.main", *map(str, command)], check=True, capture_output=True)
     first, second = ((out / "trajectory.txt").read_bytes() for out in outs)
     assert first == second

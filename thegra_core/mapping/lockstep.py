@@ -14,8 +14,8 @@ from thegra_core.process import Usage, call_now
 
 GROWN_AFTER = 2
 """Calls of `updates` after a keyframe at which its new landmarks are given; `Slam` calls it before and after each frame: the next frame has them."""
-SETTLED_AFTER = 12
-"""The same for all else that comes of it: five frames later."""
+SETTLED_AFTER = 10
+"""The same for all else that comes of it: four frames later."""
 
 
 class LockstepMapping:

@@ -12,7 +12,7 @@ from thegra_core.mapping.mapper import Mapper
 from thegra_core.messages import InitialMap, Keyframe, MapUpdate
 from thegra_core.process import Usage, call_now
 
-MOST_LEFT = 4
+MOST_LEFT = 1
 """Keyframes in a row that are left before all is done because others wait; fewer than the keyframes that a local adjustment takes in."""
 
 

@@ -474,10 +474,9 @@ class TrackingStage:
             candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
         else:
             candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
-        found = relocalize(place.map, features, candidates, self._matcher, self._config, nearby, {place.reference_id: matches})
-        if found is None and self._thorough is not None:
-            found = relocalize(place.map, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, self._config, nearby)
-        return found
+        if self._thorough is not None:
+            return relocalize(place.map, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, self._config, nearby)
+        return relocalize(place.map, features, candidates, self._matcher, self._config, nearby, {place.reference_id: matches})
 
     def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:
