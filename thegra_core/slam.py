@@ -120,7 +120,7 @@ class Slam:
         nearest = Nearest(config.matcher) if config.tracking.match_by == "nearest" and matcher is None else None
         self._matcher = make_frame_matcher(config, nearest or matcher)
         learned = make_matcher(config.matcher, config.extractor) if nearest is not None else None
-        thorough = TrackMatcher(TurningMatcher(learned), 10**9) if learned is not None else None
+        self._thorough = TrackMatcher(TurningMatcher(learned), 10**9) if learned is not None else None
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
@@ -133,7 +133,7 @@ class Slam:
             self._mapping = LockstepMapping(MappingProcess(camera, config, make_frame_matcher, timely=False))
         else:
             self._mapping = InlineMapping(Mapper(camera, config, make_frame_matcher(config, learned) if learned is not None else self._matcher, solver))
-        self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit, thorough)
+        self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit, self._thorough)
         self._frames: list[_Placed] = []
         self._keep_records = keep_records
         self._last_stamp_ns: int | None = None
@@ -151,7 +151,8 @@ class Slam:
         width, height = self._camera.image_size
         noise = np.random.default_rng(0).integers(0, 255, (height, width), np.uint8)
         features = self._extractor.extract(self._chain(noise, 0), 0)
-        self._matcher.match(features, features)
+        for matcher in filter(None, (self._matcher, self._thorough)):
+            matcher.match(features, features)
         self._chain.reset()
         self._mapping.usage()
 
