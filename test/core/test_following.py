@@ -16,7 +16,7 @@ from thegra_core.config import FlowConfig, ThegraConfig
 from thegra_core.errors import MappingError, WeightsError
 from thegra_core.features.protocols import Wanted
 from thegra_core.features.tracks import TrackMatcher
-from thegra_core.mapping.lockstep import SETTLED_AFTER, LockstepMapping
+from thegra_core.mapping.lockstep import ANSWERED_AFTER, LockstepMapping
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.process import MappingProcess
 from thegra_core.mapping.service import MOST_LEFT, InlineMapping
@@ -327,10 +327,6 @@ class Answering:
     def insert(self, keyframe: int) -> None:
         self.asked.append(f"insert {keyframe}")
 
-    def next_updates(self) -> list[str]:
-        self.asked.append("next")
-        return ["grown"]
-
     def last_updates(self) -> list[str]:
         self.asked.append("last")
         return ["settled"]
@@ -342,10 +338,10 @@ def test_answers_in_lockstep_come_at_fixed_calls_and_before_the_next_keyframe() 
     mapping.insert(1)  # type: ignore[arg-type]
     mapping.updates()
     process.asked.clear()
-    assert [mapping.updates() for _ in range(SETTLED_AFTER)] == [["grown"], *[[]] * (SETTLED_AFTER - 3), ["settled"], []]
+    assert [mapping.updates() for _ in range(ANSWERED_AFTER)] == [["settled"], []]
     mapping.insert(2)  # type: ignore[arg-type]
     mapping.insert(3)  # type: ignore[arg-type]
-    assert process.asked == ["next", "last", "last", "insert 2", "last", "insert 3"]
+    assert process.asked == ["last", "last", "insert 2", "last", "insert 3"]
     assert mapping.updates() == ["settled", "settled"]
 
 

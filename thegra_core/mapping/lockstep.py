@@ -12,10 +12,10 @@ from thegra_core.mapping.process import MappingProcess
 from thegra_core.messages import InitialMap, Keyframe, MapUpdate
 from thegra_core.process import Usage, call_now
 
-GROWN_AFTER = 2
-"""Calls of `updates` after a keyframe at which its new landmarks are given; `Slam` calls it before and after each frame: the next frame has them."""
-SETTLED_AFTER = 10
-"""The same for all else that comes of it: four frames later."""
+ANSWERED_AFTER = 2
+"""Calls of `updates` after a keyframe at which all that comes of it is given. `Slam` calls it before and after each frame is tracked: mapping works while the
+next frame is read, filtered and followed, and tracking has the adjusted map then. In quick motion, where nearly every frame is a keyframe, what comes later
+comes too late (measured: four frames later the error of a room is 1.2 m instead of 0.06, two frames later 0.1)."""
 
 
 class LockstepMapping:
@@ -27,7 +27,7 @@ class LockstepMapping:
     def __init__(self, beside: MappingProcess) -> None:
         self._beside = beside
         self._updates: list[MapUpdate] = []
-        self._calls = SETTLED_AFTER
+        self._calls = ANSWERED_AFTER
 
     def initialize(self, initial: InitialMap) -> None:
         """See `MappingService.initialize`; the map is there when it returns."""
@@ -53,9 +53,7 @@ class LockstepMapping:
             MappingError: If mapping has ended with an error.
         """
         self._calls += 1
-        if self._calls == GROWN_AFTER:
-            self._updates += self._beside.next_updates()
-        if self._calls == SETTLED_AFTER:
+        if self._calls == ANSWERED_AFTER:
             self._collect()
         taken, self._updates = self._updates, []
         return taken

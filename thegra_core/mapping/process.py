@@ -103,17 +103,6 @@ class MappingProcess:
         taken, self._updates = self._updates, []
         return taken
 
-    def next_updates(self) -> list[MapUpdate]:
-        """`updates`, and if there are none, wait for the next ones; none if all is done that was handed over.
-
-        Raises:
-            MappingError: As `updates`.
-        """
-        while not self._updates and self._undone:
-            self._take(self._receive())
-        taken, self._updates = self._updates, []
-        return taken
-
     def last_updates(self) -> list[MapUpdate]:
         """The updates still to come of what was handed over; waits until all is done.
 
