@@ -279,7 +279,6 @@ class KeyframeConfig(Section):
 class MappingConfig(Section):
     """Growing and cleaning the map."""
 
-    lockstep: bool = Field(False, description="for recordings: map in a process of its own while tracking goes on, with answers at fixed frames, so that a run can be repeated; off: one after the other")
     covisibility_threshold: int = Field(15, ge=1, description="shared landmarks that make an edge; ORB-SLAM3: 15")
     neighbours: int = Field(3, ge=1, le=30, description="covisible keyframes that a new keyframe is matched to, its reference among them; ORB-SLAM3: 30, with learned matching each but the reference costs a network run")
     chained_keyframes: int = Field(10, ge=0, description="keyframes that a new one is matched to through a common neighbour, without the network")

@@ -23,7 +23,6 @@ from thegra_core.features.tracks import TrackMatcher, shared_tracks
 from thegra_core.features.turning import TurnableExtractor, TurningMatcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map, summarize
-from thegra_core.mapping.lockstep import LockstepMapping
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.process import MappingProcess
 from thegra_core.mapping.service import InlineMapping, MappingService
@@ -90,7 +89,6 @@ class Slam:
         keep_records: Remember every frame for `finish`. A live stream has no end and needs only the last one.
         beside: Map in a process of its own, with the matcher configured: `process` never waits for it, and what becomes of a run depends on the machine.
         mapping: Maps instead of what `beside` says; without a map, and of the same camera and configuration. It is this system's to close.
-        lockstep: Map in a process of its own, too, but take what comes of it at fixed frames, waiting for it if need be: the same frames give the same run.
         solver: Makes the full adjustments after loops and merges, see `Mapper`; beside, they are made in processes of their own.
 
     Raises:
@@ -107,7 +105,6 @@ class Slam:
         keep_records: bool = True,
         beside: bool = False,
         mapping: MappingService | None = None,
-        lockstep: bool = False,
         solver: BundleSolver | None = None,
     ) -> None:
         self._camera = camera
@@ -129,8 +126,6 @@ class Slam:
             self._mapping = mapping
         elif beside:
             self._mapping = MappingProcess(camera, config, make_frame_matcher)
-        elif lockstep:
-            self._mapping = LockstepMapping(MappingProcess(camera, config, make_frame_matcher, timely=False))
         else:
             self._mapping = InlineMapping(Mapper(camera, config, make_frame_matcher(config, learned) if learned is not None else self._matcher, solver))
         self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit, self._thorough)

@@ -16,7 +16,6 @@ from thegra_core.config import FlowConfig, ThegraConfig
 from thegra_core.errors import MappingError, WeightsError
 from thegra_core.features.protocols import Wanted
 from thegra_core.features.tracks import TrackMatcher
-from thegra_core.mapping.lockstep import ANSWERED_AFTER, LockstepMapping
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.process import MappingProcess
 from thegra_core.mapping.service import MOST_LEFT, InlineMapping
@@ -297,52 +296,6 @@ def test_a_map_that_took_its_time_is_caught_up_with() -> None:
     assert slam.map_size()[0] > keyframes > 0, "keyframes from the time in between"
     assert all(r.state is TrackingState.TRACKING for r in play(slam, 15, begun + 12))
     assert slam.finish().losses == 0
-
-
-# ---- the same beside tracking, in lockstep ----------------------------------------------------------------------------------------
-
-
-def in_lockstep(count: int) -> tuple[list[TrackingResult], Run]:
-    slam, _, _ = make(WALK)
-    slam._mapping = LockstepMapping(MappingProcess(CAMERA, FOLLOWING, fake_matcher, timely=False))
-    try:
-        return play(slam, count), slam.finish()
-    finally:
-        slam.close()
-
-
-def test_mapping_in_lockstep_gives_the_same_bytes_and_tracks_as_well() -> None:
-    (results, run), (_, again) = in_lockstep(60), in_lockstep(60)
-    assert [f.world_from_camera.tobytes() for f in run.frames] == [f.world_from_camera.tobytes() for f in again.frames]
-    assert ate(run, WALK)[0] < 0.004 and (run.losses, len(run.maps)) == (0, 1)
-    assert sum(r.is_keyframe for r in results) > 5
-
-
-class Answering:
-    """A process of mapping whose answers are in; notes what it is asked for."""
-
-    def __init__(self) -> None:
-        self.asked: list[str] = []
-
-    def insert(self, keyframe: int) -> None:
-        self.asked.append(f"insert {keyframe}")
-
-    def last_updates(self) -> list[str]:
-        self.asked.append("last")
-        return ["settled"]
-
-
-def test_answers_in_lockstep_come_at_fixed_calls_and_before_the_next_keyframe() -> None:
-    process = Answering()
-    mapping = LockstepMapping(process)  # type: ignore[arg-type]
-    mapping.insert(1)  # type: ignore[arg-type]
-    mapping.updates()
-    process.asked.clear()
-    assert [mapping.updates() for _ in range(ANSWERED_AFTER)] == [["settled"], []]
-    mapping.insert(2)  # type: ignore[arg-type]
-    mapping.insert(3)  # type: ignore[arg-type]
-    assert process.asked == ["last", "last", "insert 2", "last", "insert 3"]
-    assert mapping.updates() == ["settled", "settled"]
 
 
 def test_tracking_goes_on_while_mapping_is_behind(beside: Slam) -> None:

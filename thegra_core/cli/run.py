@@ -166,7 +166,7 @@ def make_system(camera: CameraModel, config: ThegraConfig, extractor: Extractor 
     set_threads(config.threads)
     from thegra_core.slam import Slam
 
-    return Slam(camera, config, extractor, matcher, lockstep=config.mapping.lockstep)
+    return Slam(camera, config, extractor, matcher)
 
 
 def make_live_system(camera: CameraModel, config: ThegraConfig) -> System:

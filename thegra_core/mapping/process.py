@@ -48,15 +48,13 @@ MakeMatcher = Callable[[ThegraConfig], Matcher]
 class MappingProcess:
     """`MappingService` in a process of its own with one thread.
 
-    Args:
-        make_matcher: See `MakeMatcher`.
-        timely: Work is left out where more waits, and full adjustments have processes of their own. Without it what comes of the work does not depend on time.
+    Work is left out where more waits, and full adjustments have processes of their own.
 
     Raises:
         WeightsError: If the matcher's weights are not there; from the first call that waits for an answer, or `updates`.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, make_matcher: MakeMatcher, *, timely: bool = True) -> None:
+    def __init__(self, camera: CameraModel, config: ThegraConfig, make_matcher: MakeMatcher) -> None:
         ours, theirs = socket.socketpair()
         self._lifeline = Lifeline()
         with theirs:
@@ -70,8 +68,7 @@ class MappingProcess:
         self._writer.start()
         self._updates: list[MapUpdate] = []
         self._submitted: deque[Future[Any]] = deque()
-        self._undone = 0
-        self._tell("equip", config, make_matcher, timely)
+        self._tell("equip", config, make_matcher)
         self._tell("begin", camera)
 
     def begin(self, camera: CameraModel) -> None:
@@ -86,15 +83,15 @@ class MappingProcess:
 
     def initialize(self, initial: InitialMap) -> None:
         """See `MappingService.initialize`."""
-        self._give("initialize", initial)
+        self._tell("initialize", initial)
 
     def insert(self, keyframe: Keyframe) -> None:
         """See `MappingService.insert`."""
-        self._give("insert", keyframe)
+        self._tell("insert", keyframe)
 
     def drop(self, map_id: int) -> None:
         """See `MappingService.drop`."""
-        self._give("drop", map_id)
+        self._tell("drop", map_id)
 
     def updates(self) -> list[MapUpdate]:
         """See `MappingService.updates`."""
@@ -102,16 +99,6 @@ class MappingProcess:
             self._take(self._receive())
         taken, self._updates = self._updates, []
         return taken
-
-    def last_updates(self) -> list[MapUpdate]:
-        """The updates still to come of what was handed over; waits until all is done.
-
-        Raises:
-            MappingError: As `updates`.
-        """
-        while self._undone:
-            self._take(self._receive())
-        return self.updates()
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """See `MappingService.submit`."""
@@ -165,10 +152,6 @@ class MappingProcess:
 
     # ---- steps ----------------------------------------------------------------------------------------------------------------------
 
-    def _give(self, name: str, argument: Any) -> None:
-        self._undone += 1
-        self._tell(name, argument)
-
     def _tell(self, name: str, *arguments: Any) -> None:
         self._outbox.put((name, arguments))
 
@@ -190,9 +173,6 @@ class MappingProcess:
             raise MappingError(f"the process of the mapping stage has failed:\n{content}")
         if kind == "result":
             self._submitted.popleft().set_result(content)
-            return
-        if kind == "done":
-            self._undone -= 1
             return
         self._updates.extend(content)
 
@@ -253,8 +233,6 @@ def serve(connection: Connection) -> None:
     mapping: InlineMapping | None = None
     config: ThegraConfig
     matcher: Matcher
-    timely = True
-    others_wait = _never
     while True:
         try:
             name, arguments = inbox.next()
@@ -262,18 +240,18 @@ def serve(connection: Connection) -> None:
             return
         try:
             if name == "equip":
-                config, make_matcher, timely = arguments
-                matcher, others_wait = make_matcher(config), inbox.work_waits if timely else _never
+                config, make_matcher = arguments
+                matcher = make_matcher(config)
                 continue
             if name == "begin":
                 if mapping is not None:
                     for known in mapping.maps():  # also what is solved for them elsewhere
                         mapping.drop(known.map_id)
                 (camera,) = arguments
-                mapping = InlineMapping(Mapper(camera, config, matcher, ProcessSolver() if timely else None))
+                mapping = InlineMapping(Mapper(camera, config, matcher, ProcessSolver()))
                 continue
             assert mapping is not None
-            for answer in _do(mapping, name, arguments, others_wait):
+            for answer in _do(mapping, name, arguments, inbox.work_waits):
                 connection.send(answer)
         except (ConnectionError, EOFError):  # who asked has gone
             return
@@ -282,21 +260,15 @@ def serve(connection: Connection) -> None:
             return
 
 
-def _never() -> bool:
-    return False
-
-
 def _do(mapping: InlineMapping, name: str, arguments: tuple[Any, ...], others_wait: Callable[[], bool]) -> Iterator[tuple[str, Any]]:
     """What is to be sent back, each as soon as it is there."""
     if name == "insert":
         (keyframe,) = arguments
         for update in mapping.insert_by_steps(keyframe, others_wait):
             yield "updates", [update]
-        yield "done", None
     elif name in ("initialize", "drop"):
         getattr(mapping, name)(*arguments)
         yield "updates", mapping.updates()
-        yield "done", None
     elif name == "call":
         function, *rest = arguments
         yield "result", function(*rest)
