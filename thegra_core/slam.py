@@ -117,7 +117,7 @@ class Slam:
         nearest = Nearest(config.matcher) if config.tracking.match_by == "nearest" and matcher is None else None
         self._matcher = make_frame_matcher(config, nearest or matcher)
         learned = make_matcher(config.matcher, config.extractor) if nearest is not None else None
-        self._thorough = TrackMatcher(TurningMatcher(learned), 10**9) if learned is not None else None
+        self._thorough = TrackMatcher(TurningMatcher(learned), None) if learned is not None else None
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)

@@ -75,7 +75,7 @@ def test_two_places_in_one_recording_stay_two(shared_data: Path, one: str, other
 def test_two_streets_are_told_apart(tmp_path: Path) -> None:
     """Streets have the same cars at their sides: 30 to 40 landmarks of one agree with a pose in the other, a tenth of what should be seen from there."""
     if missing_weights("realtime"):
-        pytest.skip(f"no weights of profile realtime: {missing_weights('realtime')}")
+        pytest.skip(f"NOT TESTED, no weights: {missing_weights('realtime')}")
     folders = []
     for seed, style in ((301, "robust"), (303, "aggressive")):
         options = SimulationOptions.model_validate({"scene": "street", "style": style, "duration_s": 6, "image_size": (320, 256), "seed": seed})

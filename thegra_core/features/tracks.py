@@ -11,9 +11,12 @@ from thegra_core.messages import Features, Matches
 
 
 class TrackMatcher:
-    """`Matcher` that pairs keypoints by the number of their track where two frames share `min_shared` tracks; where they do not, another matcher pairs the rest."""
+    """`Matcher` that pairs keypoints by the number of their track where two frames share `min_shared` tracks; where they do not, another matcher pairs the rest.
 
-    def __init__(self, matcher: Matcher, min_shared: int) -> None:
+    min_shared None: tracks are never enough, the other matcher is always asked.
+    """
+
+    def __init__(self, matcher: Matcher, min_shared: int | None) -> None:
         self.name = matcher.name
         self._matcher = matcher
         self._min_shared = min_shared
@@ -21,7 +24,7 @@ class TrackMatcher:
     def match(self, query: Features, reference: Features) -> Matches:
         """See `Matcher.match`."""
         shared = shared_tracks(query, reference)
-        return shared if len(shared) >= self._min_shared else completed(shared, self._matcher.match(query, reference))
+        return shared if self._min_shared is not None and len(shared) >= self._min_shared else completed(shared, self._matcher.match(query, reference))
 
     def match_many(self, query: Features, references: Sequence[Features]) -> list[Matches]:
         """See `Matcher.match_many`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +26,13 @@ from thegra_core.messages import (
     Matches,
     TrackingResult,
     TrackingState,
-    VisibilityCounts,
 )
 from thegra_core.places.index import PlaceIndex
 from thegra_core.process import Submit, call_now
-from thegra_core.tracking.followed import NotPlaced, TrackLandmarks, localize_followed
+from thegra_core.tracking.followed import NotPlaced, localize_followed
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
-from thegra_core.tracking.motion import MotionModel
+from thegra_core.tracking.place import Place
 from thegra_core.tracking.relocalizer import doubt_of, evidence, last_keyframes, nearest_in_time, relocalize, similar_keyframes
 from thegra_core.tracking.tracker import FrameView, Localization, best_reference, localize
 
@@ -72,66 +71,6 @@ class LateLocalization:
     reference_from_camera: FloatArray
 
 
-@dataclass(slots=True)
-class _Place:
-    """Where tracking is: a replica of a map and of its places, keyframes of it, and what has been seen since the last one.
-
-    resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet, and
-    their poses. missed: frames that came while mapping made the map.
-    """
-
-    map: Map
-    places: PlaceIndex
-    reference_id: int
-    last_keyframe_id: int
-    probation: int
-    lost_frames: int = 0
-    search_frames: int = 0
-    resumed: bool = False
-    motion: MotionModel = field(default_factory=MotionModel)
-    visible: list[IntArray] = field(default_factory=list)
-    found: list[IntArray] = field(default_factory=list)
-    tracks: TrackLandmarks = field(default_factory=TrackLandmarks)
-    pending: dict[int, FloatArray] = field(default_factory=dict)
-    missed: list[Features] = field(default_factory=list)
-
-    @property
-    def begun(self) -> bool:
-        """Whether mapping has made the first keyframes of the map."""
-        return self.reference_id in self.map.keyframes
-
-    @property
-    def reference(self) -> Features:
-        return self.map.keyframes[self.reference_id].features
-
-    @property
-    def last_keyframe_pose(self) -> FloatArray:
-        return self.pending[max(self.pending)] if self.pending else self.map.keyframes[self.last_keyframe_id].world_from_camera
-
-    def take(self, update: MapUpdate) -> None:
-        self.map.apply(update)
-        for removed in update.removed_keyframes:
-            self.places.remove(removed.id)
-        for message in update.new_keyframes:
-            self.pending.pop(message.id, None)
-        for message in update.new_keyframes:
-            self.places.add(message.id, message.features)
-        for state in update.keyframes:
-            if state.id == self.last_keyframe_id:
-                self.tracks.take(self.map.keyframes[state.id].features, state.landmark_ids)
-
-    def predict(self, stamp_ns: int) -> FloatArray | None:
-        return self.motion.predict(stamp_ns) if self.lost_frames == 0 else None
-
-    def take_counts(self) -> VisibilityCounts:
-        visible, visible_counts = np.unique(np.concatenate(self.visible), return_counts=True)
-        found, found_counts = np.unique(np.concatenate(self.found), return_counts=True)
-        counts = np.zeros(len(visible), dtype=np.int64)
-        counts[np.searchsorted(visible, found)] = found_counts
-        self.visible, self.found = [], []
-        return VisibilityCounts(visible, visible_counts.astype(np.int64), counts)
-
-
 class TrackingStage:
     """State of tracking: the place in the current map, the map before it while a new one is on probation, and the search for a first map.
 
@@ -145,8 +84,8 @@ class TrackingStage:
         self._matcher = matcher
         self._thorough = thorough
         self._initializer = Initializer(camera, config, matcher, submit)
-        self._place: _Place | None = None
-        self._before: _Place | None = None
+        self._place: Place | None = None
+        self._before: Place | None = None
         self._next_keyframe_id = 0
         self._next_map_id = 0
         self._unplaced: deque[Features] = deque(maxlen=config.relocalization.remembered_frames)
@@ -177,9 +116,10 @@ class TrackingStage:
         frames as may wait for mapping are placed, evenly spread to the newest.
         """
         place = self._place
-        if place is None or not place.begun or not place.missed:
+        if place is None or not place.begun or place.awaited_since_ns is None:
             return []
-        missed, place.missed = [f for f in place.missed if f.track_ids is not None], []
+        missed = [f for f in self._unplaced if f.stamp_ns > place.awaited_since_ns and f.track_ids is not None]
+        place.awaited_since_ns = None
         most = self._config.keyframe.most_pending
         rows = np.unique(np.linspace(0, len(missed) - 1, most + 1).round().astype(int)[1:]) if missed else ()
         due = (self._placed_late(place, missed[row]) for row in rows)
@@ -243,7 +183,7 @@ class TrackingStage:
         New maps and keyframes get ids that the map does not hold, from `next_map_id` and `next_keyframe_id` on: mapping may have other maps beside it.
         """
         newest = max(m.id for m in update.new_keyframes)
-        place = _Place(Map(update.map_id, self._camera), self._place_index(), newest, newest, probation=0, lost_frames=1, resumed=True)
+        place = Place(Map(update.map_id, self._camera), self._place_index(), newest, newest, probation=0, lost_frames=1, resumed=True)
         place.search_frames = self._config.relocalization.search_frames
         self._place = place
         self._next_map_id, self._next_keyframe_id = max(update.map_id + 1, next_map_id), max(newest + 1, next_keyframe_id)
@@ -332,7 +272,7 @@ class TrackingStage:
             return TrackingOutput(result, matches=matches)
         return self._begin_map(features, initial)
 
-    def _placed_late(self, place: _Place, features: Features) -> Keyframe | None:
+    def _placed_late(self, place: Place, features: Features) -> Keyframe | None:
         """A frame that came before its map did, as a keyframe if it finds a place and one is due."""
         assert features.track_ids is not None
         predicted = place.predict(features.stamp_ns)
@@ -343,23 +283,22 @@ class TrackingStage:
         place.tracks.replace(features, found.landmark_ids)
         return self._as_keyframe(place, features, found, self._matcher.match(features, place.reference))
 
-    def _wait_for_map(self, place: _Place, features: Features) -> TrackingOutput:
+    def _wait_for_map(self, place: Place, features: Features) -> TrackingOutput:
         """Mapping has not made the new map yet."""
         self._unplaced.append(features)
-        place.missed.append(features)
         state = TrackingState.INITIALIZING if self._before is None else TrackingState.LOST
         return TrackingOutput(TrackingResult(features.stamp_ns, state, keypoints=len(features), map_id=place.map.map_id, reason="a new map is being made"))
 
     def _begin_map(self, features: Features, initial: InitialMap) -> TrackingOutput:
         last = initial.keyframes[-1]
-        place = _Place(Map(initial.map_id, self._camera), self._place_index(), last.id, last.id, self._config.initialization.probation_frames)
+        place = Place(Map(initial.map_id, self._camera), self._place_index(), last.id, last.id, self._config.initialization.probation_frames)
         for keyframe in initial.keyframes[-2:]:
             place.motion.update(keyframe.stamp_ns, keyframe.world_from_camera)
+        place.awaited_since_ns = last.stamp_ns
         self._before, self._place = self._place, place
         self._next_map_id += 1
         self._next_keyframe_id += len(initial.keyframes)
         if last.stamp_ns != features.stamp_ns:  # it was solved meanwhile: the frames to come are tracked in it
-            place.missed = [f for f in self._unplaced if f.stamp_ns > last.stamp_ns]
             return replace(self._wait_for_map(place, features), initial_map=initial)
         keypoints = np.flatnonzero(last.landmark_ids != NO_LANDMARK)
         estimate = FrameView(features, self._camera, self._config).refine(
@@ -372,7 +311,7 @@ class TrackingStage:
         )  # fmt: skip
         return self._claim(place, features, TrackingOutput(result, initial_map=initial, landmark_ids=last.landmark_ids, matches=last.reference_matches))
 
-    def _accept(self, place: _Place, features: Features, found: Localization, matches: Matches) -> TrackingOutput:
+    def _accept(self, place: Place, features: Features, found: Localization, matches: Matches) -> TrackingOutput:
         if place.lost_frames:
             told = "found again at %.3f s in map %d after %d frames: %d landmarks of the most similar keyframe agree, %d should be seen from there"
             logger.info(told, features.stamp_ns / 1e9, place.map.map_id, place.lost_frames, *evidence(place.map, found, place.reference_id, self._config))
@@ -390,13 +329,13 @@ class TrackingStage:
         result = self._result(place, features, found, keyframe.id if keyframe is not None else matched_to, keyframe is not None)
         return self._claim(place, features, TrackingOutput(result, keyframe, landmark_ids=found.landmark_ids, matches=matches))
 
-    def _accept_followed(self, place: _Place, features: Features, found: Localization, matches: Matches | None) -> TrackingOutput:
+    def _accept_followed(self, place: Place, features: Features, found: Localization, matches: Matches | None) -> TrackingOutput:
         place.search_frames = 0
         self._note(place, features, found)
         result = self._result(place, features, found, place.reference_id, is_keyframe=False)
         return self._claim(place, features, TrackingOutput(result, landmark_ids=found.landmark_ids, matches=matches))
 
-    def _note(self, place: _Place, features: Features, found: Localization) -> None:
+    def _note(self, place: Place, features: Features, found: Localization) -> None:
         """A frame was placed: motion goes on from it, and its landmarks were seen."""
         place.probation = max(0, place.probation - 1)
         place.motion.update(features.stamp_ns, found.world_from_camera, found.covariance)
@@ -405,13 +344,13 @@ class TrackingStage:
             place.found.append(found.landmark_ids[found.landmark_ids >= 0])
 
     @staticmethod
-    def _result(place: _Place, features: Features, found: Localization, reference_id: int, is_keyframe: bool) -> TrackingResult:
+    def _result(place: Place, features: Features, found: Localization, reference_id: int, is_keyframe: bool) -> TrackingResult:
         return TrackingResult(
             features.stamp_ns, TrackingState.TRACKING, found.world_from_camera, found.covariance, place.motion.twist(), len(features), found.matches,
             found.inliers, len(found.visible_ids), is_keyframe, place.map.map_id, reference_id,
         )  # fmt: skip
 
-    def _claim(self, place: _Place, features: Features, output: TrackingOutput) -> TrackingOutput:
+    def _claim(self, place: Place, features: Features, output: TrackingOutput) -> TrackingOutput:
         """The output as it may be told: a pose only once the map has stood its probation."""
         if place.probation == 0:
             self._initializer.reset()
@@ -423,7 +362,7 @@ class TrackingStage:
         counts = TrackingResult(features.stamp_ns, state, keypoints=len(features), matches=output.result.matches, inliers=output.result.inliers, reason=reason)
         return replace(output, result=counts, provisional=output.result)
 
-    def _as_keyframe(self, place: _Place, features: Features, found: Localization, matches: Matches) -> Keyframe | None:
+    def _as_keyframe(self, place: Place, features: Features, found: Localization, matches: Matches) -> Keyframe | None:
         """The frame as a keyframe message if one is due."""
         if not self._keyframe_due(place, found):
             return None
@@ -435,7 +374,7 @@ class TrackingStage:
         place.pending[keyframe.id] = keyframe.world_from_camera
         return keyframe
 
-    def _keyframe_due(self, place: _Place, found: Localization) -> bool:
+    def _keyframe_due(self, place: Place, found: Localization) -> bool:
         if self.localization_only or len(place.pending) >= self._config.keyframe.most_pending:
             return False
         reference = place.map.keyframes[place.reference_id]
@@ -443,7 +382,7 @@ class TrackingStage:
         depth = place.map.median_depth(place.reference_id, found.world_from_camera)
         return bool(needs_keyframe(place.last_keyframe_pose, found.world_from_camera, depth, tracked_ratio, self._config.keyframe))
 
-    def _recover(self, place: _Place, features: Features, matches: Matches, reason: str, turned: Iterable[Features]) -> TrackingOutput:
+    def _recover(self, place: Place, features: Features, matches: Matches, reason: str, turned: Iterable[Features]) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
         if place.probation:
             dropped = self._drop()
@@ -466,7 +405,7 @@ class TrackingStage:
             return TrackingOutput(result)
         return self._stay_lost(place, features, reason)
 
-    def _seek(self, place: _Place, features: Features, matches: Matches) -> tuple[Localization, int, Matches] | None:
+    def _seek(self, place: Place, features: Features, matches: Matches) -> tuple[Localization, int, Matches] | None:
         """Match a frame to the last keyframes or, once it is lost, to those that look most alike; `matches` are to the reference."""
         settings = self._config.relocalization
         nearby = place.lost_frames == 0
@@ -478,7 +417,7 @@ class TrackingStage:
             return relocalize(place.map, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, self._config, nearby)
         return relocalize(place.map, features, candidates, self._matcher, self._config, nearby, {place.reference_id: matches})
 
-    def _stay_lost(self, place: _Place, features: Features, reason: str) -> TrackingOutput:
+    def _stay_lost(self, place: Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:
             self.losses += 1
             logger.warning("lost at %.3f s: %s", features.stamp_ns / 1e9, reason)

@@ -1,0 +1,77 @@
+"""Where tracking is: its replica of a map, and what it knows there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from thegra_core.map.map import Map
+from thegra_core.messages import Features, MapUpdate, VisibilityCounts
+from thegra_core.places.index import PlaceIndex
+from thegra_core.tracking.followed import TrackLandmarks
+from thegra_core.tracking.motion import MotionModel
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(slots=True)
+class Place:
+    """Where tracking is: a replica of a map and of its places, keyframes of it, and what has been seen since the last one.
+
+    resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet, and
+    their poses. awaited_since_ns: stamp after which frames came while mapping made the map, until they have been looked at.
+    """
+
+    map: Map
+    places: PlaceIndex
+    reference_id: int
+    last_keyframe_id: int
+    probation: int
+    lost_frames: int = 0
+    search_frames: int = 0
+    resumed: bool = False
+    motion: MotionModel = field(default_factory=MotionModel)
+    visible: list[IntArray] = field(default_factory=list)
+    found: list[IntArray] = field(default_factory=list)
+    tracks: TrackLandmarks = field(default_factory=TrackLandmarks)
+    pending: dict[int, FloatArray] = field(default_factory=dict)
+    awaited_since_ns: int | None = None
+
+    @property
+    def begun(self) -> bool:
+        """Whether mapping has made the first keyframes of the map."""
+        return self.reference_id in self.map.keyframes
+
+    @property
+    def reference(self) -> Features:
+        return self.map.keyframes[self.reference_id].features
+
+    @property
+    def last_keyframe_pose(self) -> FloatArray:
+        return self.pending[max(self.pending)] if self.pending else self.map.keyframes[self.last_keyframe_id].world_from_camera
+
+    def take(self, update: MapUpdate) -> None:
+        self.map.apply(update)
+        for removed in update.removed_keyframes:
+            self.places.remove(removed.id)
+        for message in update.new_keyframes:
+            self.pending.pop(message.id, None)
+        for message in update.new_keyframes:
+            self.places.add(message.id, message.features)
+        for state in update.keyframes:
+            if state.id == self.last_keyframe_id:
+                self.tracks.take(self.map.keyframes[state.id].features, state.landmark_ids)
+
+    def predict(self, stamp_ns: int) -> FloatArray | None:
+        return self.motion.predict(stamp_ns) if self.lost_frames == 0 else None
+
+    def take_counts(self) -> VisibilityCounts:
+        visible, visible_counts = np.unique(np.concatenate(self.visible), return_counts=True)
+        found, found_counts = np.unique(np.concatenate(self.found), return_counts=True)
+        counts = np.zeros(len(visible), dtype=np.int64)
+        counts[np.searchsorted(visible, found)] = found_counts
+        self.visible, self.found = [], []
+        return VisibilityCounts(visible, visible_counts.astype(np.int64), counts)
