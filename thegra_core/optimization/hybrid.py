@@ -78,18 +78,15 @@ def estimate_hybrid_pose(landmarks: LandmarkView, shared: Sequence[SharedView], 
             pose = poses.transform(found.R, found.t)
             if np.all(np.isfinite(pose)):
                 drawn.append(pose)
-    best, best_score = None, 0.0
-    for pose in _promising(drawn, landmarks, shared, focal, threshold_px):
-        score = _agreement(pose, landmarks, shared, focal, threshold_px)
-        if score > best_score:
-            best, best_score = pose, score
-    return best
-
-
-def _promising(drawn: list[FloatArray], landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, threshold_px: float) -> list[FloatArray]:
-    """The poses whose `_agreement` is the highest but for rounding, in their order: all are scored at once, which takes a twentieth of the time."""
     if not drawn:
-        return []
+        return None
+    agreement = _agreement(drawn, landmarks, shared, focal, threshold_px)
+    best = int(np.argmax(agreement))
+    return drawn[best] if agreement[best] > 0 else None
+
+
+def _agreement(drawn: list[FloatArray], landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, threshold_px: float) -> FloatArray:
+    """Truncated quadratic scores (P,) of poses: 1 for each observation without error, 0 beyond the threshold. All at once takes a twentieth of the time."""
     stack = np.stack(drawn)
     points = landmarks.points_world @ stack[:, :3, :3].transpose(0, 2, 1) + stack[:, None, :3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -101,19 +98,12 @@ def _promising(drawn: list[FloatArray], landmarks: LandmarkView, shared: Sequenc
         lines_here, lines_there = there @ essentials.transpose(0, 2, 1), here @ essentials
         scale = (lines_here[..., :2] ** 2).sum(axis=2) + (lines_there[..., :2] ** 2).sum(axis=2)
         scores += _truncated(focal**2 * (lines_here * here).sum(axis=2) ** 2 / np.maximum(scale, 1e-30), threshold_px)
-    scores = np.nan_to_num(scores, nan=0.0)
-    return [drawn[row] for row in np.flatnonzero(scores >= scores.max() - 1e-6)]
+    return np.nan_to_num(scores, nan=0.0)
 
 
 def _truncated(squared: FloatArray, threshold_px: float) -> FloatArray:
     """Sum over the last axis of 1 for an observation without error, 0 beyond the threshold."""
     return np.asarray(np.maximum(1.0 - squared / threshold_px**2, 0.0).sum(axis=-1))
-
-
-def _agreement(pose: FloatArray, landmarks: LandmarkView, shared: Sequence[SharedView], focal: float, threshold_px: float) -> float:
-    """Truncated quadratic score: 1 for each observation without error, 0 beyond the threshold."""
-    squared = [_squared_errors(pose, landmarks, focal), *((focal * _sampson(pose, view)) ** 2 for view in shared)]
-    return float(np.maximum(1.0 - np.concatenate(squared) / threshold_px**2, 0.0).sum())
 
 
 def _squared_errors(pose: FloatArray, landmarks: LandmarkView, focal: float) -> FloatArray:
