@@ -85,7 +85,7 @@ class Slam:
     """Frames in, poses out; `finish` gives the account of the run.
 
     Args:
-        extractor, matcher: Instead of those configured.
+        extractor, matcher: Instead of those that `config.extractor` and `config.matcher` would make.
         keep_records: Remember every frame for `finish`. A live stream has no end and needs only the last one.
         beside: Map in a process of its own, with the matcher configured: `process` never waits for it, and what becomes of a run depends on the machine.
         mapping: Maps instead of what `beside` says; without a map, and of the same camera and configuration. It is this system's to close.
@@ -114,10 +114,10 @@ class Slam:
         self._masks = config.tracking.mask_fixed_pattern
         self._rotations = config.loop.rotations
         self._extractor = TurnableExtractor(extractor if extractor is not None else make_extractor(config.extractor))
-        nearest = Nearest(config.matcher) if config.tracking.match_by == "nearest" and matcher is None else None
-        self._matcher = make_frame_matcher(config, nearest or matcher)
-        learned = make_matcher(config.matcher, config.extractor) if nearest is not None else None
-        self._thorough = TrackMatcher(TurningMatcher(learned), None) if learned is not None else None
+        configured = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
+        quick = Nearest(config.matcher) if config.tracking.match_by == "nearest" else None
+        self._matcher = make_frame_matcher(config, quick or configured)
+        self._thorough = TrackMatcher(TurningMatcher(configured), None) if quick is not None else None
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
@@ -127,7 +127,7 @@ class Slam:
         elif beside:
             self._mapping = MappingProcess(camera, config, make_frame_matcher)
         else:
-            self._mapping = InlineMapping(Mapper(camera, config, make_frame_matcher(config, learned) if learned is not None else self._matcher, solver))
+            self._mapping = InlineMapping(Mapper(camera, config, make_frame_matcher(config, configured), solver))
         self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit, self._thorough)
         self._frames: list[_Placed] = []
         self._keep_records = keep_records

@@ -106,7 +106,7 @@ class LocalEngine:
     def __init__(self, config: ThegraConfig, beside: bool = False) -> None:
         self._config = config
         self._beside = beside
-        self._networks: tuple[Extractor, Matcher | None] | None = None
+        self._networks: tuple[Extractor, Matcher] | None = None
         self._slam: Slam | None = None
         self._mapping: MappingProcess | None = None
         self._epoch = -1
@@ -115,8 +115,7 @@ class LocalEngine:
         set_threads(self._config.threads)
         from thegra_core.features.registry import make_extractor, make_matcher
 
-        learned = self._config.tracking.match_by != "nearest"
-        self._networks = make_extractor(self._config.extractor), make_matcher(self._config.matcher, self._config.extractor) if learned else None
+        self._networks = make_extractor(self._config.extractor), make_matcher(self._config.matcher, self._config.extractor)
 
     def process(self, job: Job) -> Done:
         try:

@@ -150,12 +150,14 @@ def test_a_long_corridor_closes_its_loop(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("profile", ["fast", "realtime"])
 def test_same_input_same_bytes(tmp_path: Path, profile: str) -> None:
+    """Run again, and with a cache of the networks' results."""
     bag = simulate(SimulationOptions(style="aggressive", duration_s=1.5, image_size=(320, 256)), tmp_path / "bag")
     extractor = "orb" if missing_weights(profile) else "xfeat"
-    outs = [tmp_path / "first", tmp_path / "second"]
+    outs = [tmp_path / "first", tmp_path / "second", tmp_path / "cached"]
     for out in outs:
-        command = ["run", bag, "--profile", profile, "--set", f"extractor.name={extractor}", "--out", out, "--quiet"]
+        cache = ["--cache", tmp_path / "cache"] if out.name == "cached" else []
+        command = ["run", bag, "--profile", profile, "--set", f"extractor.name={extractor}", "--out", out, "--quiet", *cache]
         subprocess.run([sys.executable, "-m", "thegra_core.cli.main", *map(str, command)], check=True, capture_output=True)
-    first, second = ((out / "trajectory.txt").read_bytes() for out in outs)
-    assert first == second
+    first, second, cached = ((out / "trajectory.txt").read_bytes() for out in outs)
+    assert first == second == cached
     assert first.count(b"\n") >= 5, "bytes of nothing say nothing"
