@@ -24,7 +24,6 @@ from thegra_core.features.turning import TurnableExtractor, TurningMatcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map, summarize
 from thegra_core.mapping.mapper import Mapper
-from thegra_core.mapping.process import MappingProcess
 from thegra_core.mapping.service import InlineMapping, MappingService
 from thegra_core.messages import (
     Features,
@@ -87,9 +86,9 @@ class Slam:
     Args:
         extractor, matcher: Instead of those that `config.extractor` and `config.matcher` would make.
         keep_records: Remember every frame for `finish`. A live stream has no end and needs only the last one.
-        beside: Map in a process of its own, with the matcher configured: `process` never waits for it, and what becomes of a run depends on the machine.
-        mapping: Maps instead of what `beside` says; without a map, and of the same camera and configuration. It is this system's to close.
-        solver: Makes the full adjustments after loops and merges, see `Mapper`; beside, they are made in processes of their own.
+        mapping: Where the map is made, of the same camera and configuration, without a map; this system's to close. By default in the same thread. With a
+            `MappingProcess` `process` never waits for it, and what becomes of a run depends on the machine.
+        solver: Makes the full adjustments after loops and merges, see `Mapper`; not asked where `mapping` is given.
 
     Raises:
         WeightsError: If the configured networks' weights are not there.
@@ -103,7 +102,6 @@ class Slam:
         matcher: Matcher | None = None,
         *,
         keep_records: bool = True,
-        beside: bool = False,
         mapping: MappingService | None = None,
         solver: BundleSolver | None = None,
     ) -> None:
@@ -121,13 +119,7 @@ class Slam:
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
-        self._mapping: MappingService
-        if mapping is not None:
-            self._mapping = mapping
-        elif beside:
-            self._mapping = MappingProcess(camera, config, make_frame_matcher)
-        else:
-            self._mapping = InlineMapping(Mapper(camera, config, make_frame_matcher(config, configured), solver))
+        self._mapping = mapping if mapping is not None else InlineMapping(Mapper(camera, config, make_frame_matcher(config, configured), solver))
         self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit, self._thorough)
         self._frames: list[_Placed] = []
         self._keep_records = keep_records

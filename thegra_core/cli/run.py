@@ -172,9 +172,11 @@ def make_system(camera: CameraModel, config: ThegraConfig, extractor: Extractor 
 def make_live_system(camera: CameraModel, config: ThegraConfig) -> System:
     """The SLAM system with mapping in a process of its own."""
     set_threads(config.threads)
+    from thegra_core.features.registry import make_frame_matcher
+    from thegra_core.mapping.process import MappingProcess
     from thegra_core.slam import Slam
 
-    return Slam(camera, config, beside=True)
+    return Slam(camera, config, mapping=MappingProcess(camera, config, make_frame_matcher))
 
 
 def cached_front_end(config: ThegraConfig, folder: Path | None) -> tuple[()] | tuple[CachedExtractor, CachedMatcher]:
