@@ -1,7 +1,7 @@
 # Thegra on ROS 2 Jazzy. The project's own checks do not build it: there is no Docker where they run. It was read line by line only.
 #
 #   docker build -t thegra .
-#   docker run --rm --network host --ipc host thegra ros2 launch thegra_ros thegra.launch.py image:=/camera/image_raw profile:=fast
+#   docker run --rm --network host --ipc host thegra ros2 launch thegra_ros thegra.launch.py image:=/camera/image_raw
 #
 # --network host: DDS finds the other nodes by multicast. --ipc host: images come through shared memory from nodes of the same machine.
 FROM ros:jazzy-ros-base

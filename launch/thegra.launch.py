@@ -1,4 +1,4 @@
-"""Starts Thegra: ros2 launch thegra_ros thegra.launch.py image:=/camera/image_raw profile:=realtime
+"""Starts Thegra: ros2 launch thegra_ros thegra.launch.py image:=/camera/image_raw
 
 `ros2 launch thegra_ros thegra.launch.py --show-args` lists the arguments.
 """
@@ -20,7 +20,7 @@ ARGUMENTS = {
     "image": ("", "the camera's image topic; empty: image_raw in the namespace"),
     "camera_info": ("", "the camera's camera_info topic; empty: beside the image topic"),
     "params_file": ("", "YAML with parameters; empty: the one that ships with the package"),
-    "profile": ("", "paper, quality, fast or realtime; empty: what params_file says"),
+    "profile": ("", "paper, quality, fast or realtime; empty: what params_file says, else realtime"),
     "camera_file": ("", "calibration file; wins over camera_info; empty: what params_file says"),
     "base_frame": ("", "robot frame whose pose is published; empty: what params_file says"),
     "odom_frame": ("", "odometry frame, if there is one; empty: what params_file says"),

@@ -362,16 +362,18 @@ class ThegraConfig(Section):
     relocalization: RelocalizationConfig = RelocalizationConfig()
 
 
-def load_config(profile: str | None = None, file: Path | None = None, overrides: dict[str, Any] | None = None) -> ThegraConfig:
+def load_config(
+    profile: str | None = None, file: Path | None = None, overrides: dict[str, Any] | None = None, default: str = "quality"
+) -> ThegraConfig:
     """Profile, then file, then dotted overrides such as {"extractor.max_keypoints": "2048"}; later ones win.
 
-    A file may name the profile it builds on (`profile: fast`); `profile` given here wins over it.
+    A file may name the profile it builds on (`profile: fast`); `profile` given here wins over it, and `default` holds where neither names one.
 
     Raises:
         ConfigError: Naming the key and what it takes.
     """
     from_file = _read_yaml(file) if file is not None else {}
-    name = profile or from_file.get("profile") or "quality"
+    name = profile or from_file.get("profile") or default
     values = _merge(_profile_values(str(name)), from_file)
     values["profile"] = name
     for key, value in (overrides or {}).items():

@@ -24,14 +24,14 @@ def live(
     context: typer.Context,
     image: Annotated[str | None, typer.Option(metavar="TOPIC", help="The camera's image topic; camera_info is taken from beside it. Default: image_raw in the namespace.")] = None,
     camera: Annotated[Path | None, typer.Option(metavar="FILE", help="Camera calibration; wins over camera_info.")] = None,
-    profile: Annotated[str | None, typer.Option(help="paper, quality, fast or realtime. Default: what the file of --config names, else quality.")] = None,
+    profile: Annotated[str | None, typer.Option(help="paper, quality, fast or realtime. Default: what the file of --config names, else realtime.")] = None,
     config: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML with parameters; a run's config.yaml will do.")] = None,
     namespace: Annotated[str, typer.Option(help="Namespace of nodes and topics.")] = "thegra",
     single_process: Annotated[bool, typer.Option("--single-process/--stages", help="One node for the whole system, or one for each of its four stages.")] = True,
 ) -> None:
     """Track a live camera: images on a ROS 2 topic in, pose, path and map out.
 
-    Example: `thegra live --profile realtime --image /camera/image_raw`
+    Example: `thegra live --image /camera/image_raw`
 
     What ROS understands may follow: `--ros-args -p base_frame:=base_link -p scale:=2.0`. Ends with Ctrl-C.
     """

@@ -15,7 +15,7 @@ Made by `python -m thegra_ros.parameter_table > docs/parameters.md` from the con
 
 Of `thegra run` and the other commands: `--set KEY=VALUE`, or YAML with `--config FILE`. Of the nodes: `-p KEY:=VALUE`, or a parameter file
 ([config/params.yaml](../config/params.yaml)); numbers that may have a fraction are then written with a point. Where a profile's column is empty it has the
-value of `quality`.
+value of `quality`. `thegra run` begins with `quality`, the nodes with `realtime`.
 
 ## Of the method
 """

@@ -28,6 +28,8 @@ _NAMES = {ParameterType.PARAMETER_BOOL: "true or false", ParameterType.PARAMETER
           ParameterType.PARAMETER_STRING: "a text in quotes"}  # fmt: skip
 _LARGEST = 2**63 - 1
 ModelT = typing.TypeVar("ModelT", bound=BaseModel)
+LIVE_PROFILE = "realtime"
+"""The one that keeps up with a camera on a small computer."""
 FIXED = ("profile", "config_file")
 """Parameters that decide the defaults of the others: they are given when the node starts and cannot change."""
 
@@ -126,11 +128,11 @@ def load_defaults(node: Node) -> ThegraConfig:
         ConfigError: If a file or profile cannot be used.
     """
     own = {
-        "profile": ("", "paper, quality, fast or realtime; empty: what config_file names, else quality"),
+        "profile": ("", f"paper, quality, fast or realtime; empty: what config_file names, else {LIVE_PROFILE}"),
         "config_file": ("", "YAML with parameters as `thegra run --config` takes it; other parameters win over it"),
     }
     values = declare(node, (Declared(n, v, ParameterDescriptor(type=ParameterType.PARAMETER_STRING, description=text, read_only=True)) for n, (v, text) in own.items()))
-    return load_config(values["profile"] or None, Path(values["config_file"]).expanduser() if values["config_file"] else None)
+    return load_config(values["profile"] or None, Path(values["config_file"]).expanduser() if values["config_file"] else None, default=LIVE_PROFILE)
 
 
 def _items(name: str, text: str) -> tuple[Any, ...]:
