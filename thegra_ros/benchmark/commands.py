@@ -26,14 +26,14 @@ LIGHT = ("extractor.name=orb", "preprocessing.filters=[{filter: he_clip}]", "loo
 SIMULATED_S, SIMULATED_HZ = 8.0, 10.0
 
 InputArgument = Annotated[Path | None, typer.Argument(metavar="[INPUT]", help="A recording. Default: a simulated 640x512 room.")]
-ProfileOption = Annotated[str, typer.Option(help="paper, quality, fast or realtime.")]
-SetOption = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter; repeatable. Default: ORB and one light filter.")]
+ProfileOption = Annotated[str | None, typer.Option(help="paper, quality, fast or realtime. Default: fast with ORB and one light filter.")]
+SetOption = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter; repeatable.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def ros(
     recording: InputArgument = None,
-    profile: ProfileOption = "fast",
+    profile: ProfileOption = None,
     rate: Annotated[float, typer.Option(min=0.01, help="Frames a second; so few that each is done before the next comes.")] = 2.0,
     max_frames: Annotated[int, typer.Option(min=2, help="Use the first frames only.")] = 80,
     set_: SetOption = None,
@@ -71,7 +71,7 @@ def soak(
     warm_up: Annotated[float, typer.Option(metavar="S", min=0.0, help="Seconds at the beginning that do not count.")] = 120.0,
     rate: Annotated[float, typer.Option(min=0.1, help="Frames a second.")] = 15.0,
     stages: Annotated[bool, typer.Option("--stages", help="The four nodes in place of one.")] = False,
-    profile: ProfileOption = "fast",
+    profile: ProfileOption = None,
     set_: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -104,8 +104,10 @@ def soak(
         raise typer.Exit(1)
 
 
-def _config(profile: str, assignments: Sequence[str] | None) -> ThegraConfig:
-    return load_config(profile, overrides=parse_assignments(assignments or LIGHT))
+def _config(profile: str | None, assignments: Sequence[str] | None) -> ThegraConfig:
+    """What is named, beside the light front end where no profile is."""
+    light = LIGHT if profile is None else ()
+    return load_config(profile or "fast", overrides=parse_assignments([*light, *(assignments or ())]))
 
 
 @contextmanager
