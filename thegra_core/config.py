@@ -220,6 +220,7 @@ class FlowConfig(Section):
     patch: int = Field(15, ge=5, le=31, description="px; side of the square whose look is compared before and after")
     min_similarity: float = Field(0.7, ge=-1, le=1, description="least zero-mean normalized cross-correlation of the squares")
     border: int = Field(4, ge=0, le=64, description="px at the image's edge where nothing is followed")
+    max_points: int = Field(350, ge=32, le=8192, description="keypoints that are followed at the most; what is detected beyond is there to be matched when the camera is lost, and for places")
     min_points: int = Field(80, ge=8, description="points below which new ones are detected")
     min_share: float = Field(0.4, ge=0, le=1, description="the same, as a share of the points after the last detection")
     far_share: float = Field(0.5, ge=0, le=1, description="share of one frame's points found in the next below which they are sought with more effort: after missing frames, a closed shutter, a quick turn (video finds 0.8 to 0.95 at once, measured)")

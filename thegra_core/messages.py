@@ -7,7 +7,7 @@ Pixels are (x, y) with (0, 0) at the centre of the top-left pixel. Time is `stam
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, unique
 
 import numpy as np
@@ -22,6 +22,8 @@ ImageArray = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 
 NO_LANDMARK = -1
 """Value in `landmark_ids` of a keypoint that sees no landmark."""
+UNFOLLOWED = -1
+"""Value in `track_ids` of a keypoint that is not followed."""
 
 
 @unique
@@ -77,7 +79,7 @@ class Features:
 
     keypoints (N, 2) float32 pixels of the raw (distorted) image; scores (N,) float32 in (0, 1];
     descriptors (N, D) float32 of unit norm, or (N, D) uint8 binary; image_size (width, height). track_ids (N,) int64, where keypoints are followed
-    from image to image: those of the same number are the same point; None where they are not. `turns` are the quarter turns counter-clockwise by which the
+    from image to image: those of the same number are the same point, and those of `UNFOLLOWED` are not followed; None where none are. `turns` are the quarter turns counter-clockwise by which the
     image was turned when they were found and described; keypoints and size are those of the upright image all the same.
     """
 
@@ -92,6 +94,11 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    def chosen(self, rows: IntArray) -> Features:
+        """The keypoints of `rows` (M,) alone."""
+        ids = self.track_ids[rows] if self.track_ids is not None else None
+        return replace(self, keypoints=self.keypoints[rows], scores=self.scores[rows], descriptors=self.descriptors[rows], track_ids=ids)
 
 
 @dataclass(frozen=True, slots=True)

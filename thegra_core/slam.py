@@ -118,7 +118,7 @@ class Slam:
         self._thorough = TrackMatcher(TurningMatcher(configured), None) if quick is not None else None
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
-            self._front_end = DetectAndFollow(self._extractor, config.flow, config.extractor.max_keypoints)
+            self._front_end = DetectAndFollow(self._extractor, config.flow)
         self._mapping = mapping if mapping is not None else InlineMapping(Mapper(camera, config, make_frame_matcher(config, configured), solver))
         self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit, self._thorough)
         self._frames: list[_Placed] = []

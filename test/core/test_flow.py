@@ -8,10 +8,10 @@ import pytest
 
 from thegra_core.config import FlowConfig
 from thegra_core.features.flow import follow, normalize_contrast, patch_similarity
-from thegra_core.features.front_end import DetectAndFollow, DetectEach, merged
+from thegra_core.features.front_end import DetectAndFollow, DetectEach
 from thegra_core.features.protocols import Wanted
 from thegra_core.features.registration import coarse_shift, follow_far, overlap_shift
-from thegra_core.features.tracks import TrackMatcher, shared_tracks
+from thegra_core.features.tracks import TrackMatcher, only_followed, shared_tracks
 from thegra_core.messages import Features, Matches
 
 WIDTH, HEIGHT = 320, 256
@@ -156,9 +156,9 @@ class Corners:
         return Features(stamp_ns, points, np.full(len(points), 0.8, np.float32), descriptors, (image.shape[1], image.shape[0]), self.name)
 
 
-def front_end() -> tuple[DetectAndFollow, Corners]:
+def front_end(max_points: int = 200) -> tuple[DetectAndFollow, Corners]:
     corners = Corners()
-    return DetectAndFollow(corners, CONFIG, 200), corners
+    return DetectAndFollow(corners, CONFIG.model_copy(update={"max_points": max_points})), corners
 
 
 def test_one_detection_serves_many_images() -> None:
@@ -284,6 +284,24 @@ def test_too_few_tracks_are_kept_beside_what_the_matcher_finds() -> None:
     assert found.confidence.tolist() == [1.0, 0.5, 0.5]
 
 
-def test_there_are_never_more_keypoints_than_allowed() -> None:
-    assert len(merged(features(30, list(range(30))), features(40, None), 0.5, 50)) == 50
-    assert len(merged(features(60, list(range(60))), features(40, None), 0.5, 50)) == 60, "what is followed is kept"
+def test_keypoints_beyond_those_that_are_followed_are_there_to_be_matched() -> None:
+    picture, (end, _) = texture(), front_end(100)
+    end.follow(view(picture, 0, 0)[0], 0)
+    first = end.detect()
+    assert len(first) > 120 and len(only_followed(first)) == 100
+    followed = end.follow(view(picture, 3, 1)[0], 1)
+    assert followed is not None and 60 < len(followed) <= 100, "those alone are followed"
+    more = end.detect()
+    assert len(more) > 120 and len(only_followed(more)) == 100, "what was lost is made up for"
+    pairs = shared_tracks(more, first)
+    assert len(pairs) == len(shared_tracks(followed, first)), "keypoints that are not followed are not the same for that"
+    assert (first.track_ids[pairs.indices[:, 1]] >= 0).all()  # type: ignore[index]
+
+
+def test_keypoints_that_are_not_followed_are_matched_where_tracks_are_never_enough() -> None:
+    """Rows that the inner matcher names are those of what it was shown."""
+    query, reference = features(5, [-1, 7, -1, 9, 2], 1), features(4, [-1, 8, -1, 7], 2)
+    found = TrackMatcher(Learned((0, 0), (1, 1), (2, 0)), 3).match(query, reference)
+    assert found.indices.tolist() == [[1, 3], [4, 1]], "1 and 3 are a track; of what the matcher found among those followed (0, 1), the second is left"
+    everything = TrackMatcher(Learned((0, 0), (2, 2), (1, 1)), None).match(query, reference)
+    assert everything.indices.tolist() == [[0, 0], [1, 3], [2, 2]]

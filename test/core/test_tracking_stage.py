@@ -473,6 +473,23 @@ class Sighted(FakeMatcher):
         return replace(found, indices=found.indices[:0], confidence=found.confidence[:0]) if self.blind else found
 
 
+def test_a_frame_after_a_closure_is_found_by_few_landmarks_and_many_matches() -> None:
+    """All but a dozen landmarks are gone, and only the thorough matcher sees anything: the last keyframes, whose poses are known, give the rest."""
+    world, path = cloud(count=600, seed=1, low=(-4, -3, 3), high=(8, 3, 8)), sideways(40, 0.05)
+    pair = Pair(matcher=(matcher := Sighted()))
+    pair.tracking = TrackingStage(CAMERA, CONFIG, matcher, thorough=FakeMatcher())
+    pair.run(world, path)
+    place = pair.tracking._place
+    assert place is not None
+    seen = place.map.keyframes[place.reference_id].landmark_ids
+    alive = place.map.landmarks.alive_ids()
+    place.map.landmarks.remove(alive[~np.isin(alive, seen[seen >= 0][:12])])
+    matcher.blind = True
+    pair.tracking.reopen()
+    result = pair.tracking.process(observe(world, path[28], stamp(40), 0.3, 0.9, 10), None).result
+    assert result.state is TrackingState.TRACKING and result.inliers < CONFIG.tracking.min_inliers
+
+
 @pytest.mark.parametrize("thorough", [None, FakeMatcher()])
 def test_a_frame_that_the_matcher_does_not_place_is_given_to_the_thorough_one(thorough: FakeMatcher | None) -> None:
     world, path = cloud(count=600, seed=1, low=(-4, -3, 3), high=(8, 3, 8)), sideways(40, 0.05)

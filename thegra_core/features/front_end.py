@@ -10,12 +10,18 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from thegra_core.config import FlowConfig
+from thegra_core.features.detection import spread
 from thegra_core.features.flow import follow, normalize_contrast
 from thegra_core.features.protocols import Extractor, Wanted
 from thegra_core.features.registration import coarse_shift, follow_far
-from thegra_core.messages import Features
+from thegra_core.features.tracks import only_followed
+from thegra_core.messages import UNFOLLOWED, Features
 
 Image = NDArray[np.uint8]
+CROWDING = 1.0
+"""Of the points that are followed: each part of the image has its even share of them, see `spread`."""
+NEW = -2
+"""Number of a keypoint that may be followed from now on."""
 
 
 class DetectEach:
@@ -53,13 +59,13 @@ class DetectAndFollow:
     """`FrontEnd` that detects when it must or is told to, and follows these keypoints through the images between.
 
     A keypoint keeps number, descriptor and the score of its detection, which falls with how its surroundings change. Detecting again keeps what is
-    followed where it is, with a descriptor of what is detected there, and adds what is detected elsewhere.
+    followed where it is, with a descriptor of what is detected there, and adds what is detected elsewhere. Beyond `max_points` keypoints are not followed: they
+    are there to be matched.
     """
 
-    def __init__(self, extractor: Extractor, config: FlowConfig, max_keypoints: int) -> None:
+    def __init__(self, extractor: Extractor, config: FlowConfig) -> None:
         self._extractor = extractor
         self._config = config
-        self._max_keypoints = max_keypoints
         self._trail: _Trail | None = None
         self._next_id = 0
 
@@ -78,10 +84,15 @@ class DetectAndFollow:
         assert self._trail is not None
         trail = self._trail
         found = self._extractor.extract(trail.image, trail.features.stamp_ns)
+        candidates = spread(found.keypoints, found.scores, self._config.max_points, found.image_size, CROWDING)
+        ids = np.full(len(found), UNFOLLOWED, np.int64)
+        ids[candidates] = NEW
+        features = replace(found, track_ids=ids)
         if wanted is Wanted.MORE:
-            found = merged(trail.features, found, self._config.near_px, self._max_keypoints)
-        features = self._numbered(found)
-        self._trail = _Trail(trail.image, trail.normalized, features, len(features))
+            features = merged(trail.features, features, self._config.near_px)
+        features = self._numbered(features)
+        followed = only_followed(features)
+        self._trail = _Trail(trail.image, trail.normalized, followed, len(followed))
         return features
 
     def forget(self) -> None:
@@ -100,16 +111,19 @@ class DetectAndFollow:
         return Features(stamp_ns, result.points[chosen], scores, old.descriptors[chosen], old.image_size, old.extractor, old.track_ids[chosen], old.turns)
 
     def _numbered(self, features: Features) -> Features:
-        """Give a number to each keypoint that has none."""
-        ids = np.full(len(features), -1, np.int64) if features.track_ids is None else features.track_ids.copy()
-        new = np.flatnonzero(ids < 0)
+        """Give a number to each new keypoint, as long as there are not `max_points` with one."""
+        assert features.track_ids is not None
+        ids = features.track_ids.copy()
+        new = np.flatnonzero(ids == NEW)
+        ids[new] = UNFOLLOWED
+        new = new[: max(self._config.max_points - int((ids >= 0).sum()), 0)]
         ids[new] = np.arange(self._next_id, self._next_id + len(new))
         self._next_id += len(new)
         return replace(features, track_ids=ids)
 
 
-def merged(followed: Features, detected: Features, near_px: float, most: int) -> Features:
-    """Followed keypoints with those detected farther than `near_px` from all of them, at most `most` in all; new ones have the number -1.
+def merged(followed: Features, detected: Features, near_px: float) -> Features:
+    """Followed keypoints, and those detected farther than `near_px` from all of them with the numbers that they have.
 
     A followed keypoint takes descriptor and score of the nearest detected one that is near. Its place stays: it is what its track was measured at.
     """
@@ -121,16 +135,15 @@ def merged(followed: Features, detected: Features, near_px: float, most: int) ->
     scores = followed.scores.copy()
     descriptors[near], scores[near] = detected.descriptors[nearest[near]], detected.scores[nearest[near]]
     away = np.flatnonzero(cKDTree(followed.keypoints).query(detected.keypoints)[0] > near_px)
-    new = away[: max(most - len(followed), 0)]
-    assert followed.track_ids is not None
+    assert followed.track_ids is not None and detected.track_ids is not None
     return Features(
         detected.stamp_ns,
-        np.concatenate((followed.keypoints, detected.keypoints[new])),
-        np.concatenate((scores, detected.scores[new])),
-        np.concatenate((descriptors, np.asarray(detected.descriptors[new], descriptors.dtype))),
+        np.concatenate((followed.keypoints, detected.keypoints[away])),
+        np.concatenate((scores, detected.scores[away])),
+        np.concatenate((descriptors, np.asarray(detected.descriptors[away], descriptors.dtype))),
         detected.image_size,
         detected.extractor,
-        np.concatenate((followed.track_ids, np.full(len(new), -1, np.int64))),
+        np.concatenate((followed.track_ids, detected.track_ids[away])),
         detected.turns,
     )
 

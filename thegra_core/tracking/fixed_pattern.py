@@ -95,5 +95,4 @@ def _pixels(features: Features) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _select(features: Features, keep: BoolArray) -> Features:
-    ids = features.track_ids[keep] if features.track_ids is not None else None
-    return replace(features, keypoints=features.keypoints[keep], scores=features.scores[keep], descriptors=features.descriptors[keep], track_ids=ids)
+    return features.chosen(np.flatnonzero(keep))

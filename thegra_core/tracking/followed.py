@@ -49,6 +49,7 @@ class TrackLandmarks:
             self._ids = self._landmarks = np.empty(0, np.int64)
             return
         order = np.argsort(features.track_ids)
+        order = order[np.searchsorted(features.track_ids[order], 0) :]  # those that are followed
         self._ids, self._landmarks = features.track_ids[order], landmark_ids[order]
 
     def take(self, features: Features, landmark_ids: IntArray) -> None:
@@ -56,8 +57,9 @@ class TrackLandmarks:
         if len(self._ids) == 0:
             self.replace(features, landmark_ids)
         elif features.track_ids is not None:
-            _, here, there = np.intersect1d(self._ids, features.track_ids, assume_unique=True, return_indices=True)
-            self._landmarks[here] = landmark_ids[there]
+            rows = np.flatnonzero(features.track_ids >= 0)
+            _, here, there = np.intersect1d(self._ids, features.track_ids[rows], assume_unique=True, return_indices=True)
+            self._landmarks[here] = landmark_ids[rows[there]]
 
 
 def localize_followed(

@@ -34,7 +34,7 @@ def relocalize(
         return None
     reference_id = max(matched, key=lambda i: (len(matched[i]), i))
     found = localize(current, features, reference_id, matched, None, config)
-    if isinstance(found, str) or found.inliers < config.tracking.min_inliers:
+    if isinstance(found, str):
         return None
     reference_id = best_reference(current, found.landmark_ids, list(matched))
     doubt = "" if nearby else doubt_of(current, found, reference_id, config)

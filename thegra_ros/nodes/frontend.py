@@ -63,7 +63,7 @@ class FrontendNode(StageNode):
         extractor = make_extractor(self.config.extractor)
         nearest = Nearest(self.config.matcher) if self.config.tracking.match_by == "nearest" else None
         self._matcher = make_frame_matcher(self.config, nearest)
-        self._front: FrontEnd = DetectAndFollow(extractor, self.config.flow, self.config.extractor.max_keypoints) if self.config.flow.enabled else DetectEach(extractor)
+        self._front: FrontEnd = DetectAndFollow(extractor, self.config.flow) if self.config.flow.enabled else DetectEach(extractor)
 
     def work(self, item: Mapping[str, Any]) -> None:
         notice = read_notice(item["notice"])
