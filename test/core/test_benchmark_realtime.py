@@ -15,7 +15,7 @@ from thegra_core.evaluation.benchmark.slam import Plan, PlannedRun, RunResult, c
 MS = {"p50": 20.0, "p95": 40.0, "p99": 60.0}
 FIGURES = {
     "frames_total": 200, "dropped_frames": 3, "latency_ms": MS, "cpu_s_per_frame": 0.0421, "tracked_pct": 97.5, "ate_rmse": 0.0123, "ate_live_rmse": 0.0234,
-    "peak_rss_mb": 812.3, "ms": {"preprocessing": {"p50": 5.0, "p95": 6.0, "p99": 7.0}, "mapping": {"p50": 0.0, "p95": 0.2, "p99": 3.0}, "total": MS},
+    "peak_mb": 812.3, "ms": {"preprocessing": {"p50": 5.0, "p95": 6.0, "p99": 7.0}, "mapping": {"p50": 0.0, "p95": 0.2, "p99": 3.0}, "total": MS},
 }  # fmt: skip
 
 
@@ -64,7 +64,7 @@ def test_a_live_run_is_the_command_with_its_option(tmp_path: Path) -> None:
 def test_figures_of_a_live_run(tmp_path: Path) -> None:
     metrics = {
         "frames_total": 10, "tracked_pct": 80.0, "maps": 1, "losses": 0, "relocalizations": 0, "keyframes": 3, "landmarks": 99, "finish_s": 0.1, "loops": 0,
-        "shutter_closures": [], "cached_pct": None, "peak_rss_mb": 300.0, "ms_per_frame": MS, "fps": 9.0, "ms": {"total": MS}, "latency_ms": MS,
+        "shutter_closures": [], "cached_pct": None, "peak_mb": 300.0, "ms_per_frame": MS, "fps": 9.0, "ms": {"total": MS}, "latency_ms": MS,
         "dropped_frames": 2, "cpu_s_per_frame": 0.05,
     }  # fmt: skip
     recording = tmp_path / "recording"

@@ -25,9 +25,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
+from thegra_core.evaluation.benchmark.memory import descendants
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame
-from thegra_ros.benchmark.processes import descendants
 from thegra_ros.camera_input import described
 from thegra_ros.codec.images import camera_info_message, image_message
 from thegra_ros.codec.stamps import header, stamp_ns

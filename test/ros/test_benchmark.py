@@ -15,8 +15,8 @@ from pathlib import Path
 from ros_graph import FAST, LIMIT_S
 
 from thegra_core.errors import InputError
+from thegra_core.evaluation.benchmark.memory import descendants, resident_mb
 from thegra_ros.benchmark.latency import Alone, compare, unhindered
-from thegra_ros.benchmark.processes import descendants, resident_mb
 from thegra_ros.benchmark.soak import Plan, Sample, summary
 
 LIGHT = {**FAST, "flow.enabled": "true", "tracking.match_by": "nearest"}

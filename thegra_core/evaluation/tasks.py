@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,8 @@ from thegra_core.version import VERSION
 RAN = (0, 1)
 """Exit codes of `thegra run` that come with results: done, nothing tracked."""
 IDENTITY = "task.json"
+WATCH_S = 0.5
+"""Between two looks at a process: one takes some milliseconds of a core."""
 _ERROR_CHARACTERS = 2000
 
 
@@ -90,13 +92,27 @@ def finished(folder: Path, identity: Mapping[str, Any]) -> Outcome | None:
         return None
 
 
-def run_process(command: list[str], threads: int = 0) -> tuple[int, str]:
-    """Exit code of a command and the end of what it said on stderr; `threads` (0: not set) is told to OpenMP unless the environment does."""
+def run_process(command: list[str], threads: int = 0, watch: Callable[[int], None] | None = None) -> tuple[int, str]:
+    """Exit code of a command and the end of what it said on stderr; `threads` (0: not set) is told to OpenMP unless the environment does.
+
+    watch: called with the process's id now and then, while it runs.
+    """
     environment = dict(os.environ)
     if threads:
         environment.setdefault("OMP_NUM_THREADS", str(threads))
-    child = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace", check=False, env=environment)
-    said = child.stderr.strip()[-_ERROR_CHARACTERS:]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace", env=environment) as child:
+        try:
+            while True:
+                try:
+                    errors = child.communicate(timeout=WATCH_S if watch else None)[1]
+                    break
+                except subprocess.TimeoutExpired:
+                    assert watch is not None
+                    watch(child.pid)
+        except BaseException:
+            child.kill()
+            raise
+    said = errors.strip()[-_ERROR_CHARACTERS:]
     if child.returncode < 0:
         said = f"{said}\nended by {signal.Signals(-child.returncode).name}".strip()
     return child.returncode, said

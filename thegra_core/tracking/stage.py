@@ -414,8 +414,19 @@ class TrackingStage:
         else:
             candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
         if self._thorough is not None:
-            return relocalize(place.map, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, self._config, nearby)
+            return self._seek_thoroughly(place, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, nearby)
         return relocalize(place.map, features, candidates, self._matcher, self._config, nearby, {place.reference_id: matches})
+
+    def _seek_thoroughly(
+        self, place: Place, features: Features, candidates: list[int], matcher: Matcher, nearby: bool
+    ) -> tuple[Localization, int, Matches] | None:
+        """Match a frame to the first candidate, and to the others only if that one is not enough: a slow matcher costs frames of a live camera."""
+        first = {candidates[0]: matcher.match(features, place.map.keyframes[candidates[0]].features)}
+        for others in ([], candidates[1:]):
+            found = relocalize(place.map, features, others, matcher, self._config, nearby, first)
+            if found is not None:
+                return found
+        return None
 
     def _stay_lost(self, place: Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:

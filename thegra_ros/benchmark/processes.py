@@ -50,24 +50,3 @@ def end(processes: Sequence[subprocess.Popen[bytes]]) -> None:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-def resident_mb(pid: int) -> float:
-    """Memory of a process and its descendants, shared pages shared out among who has them (PSS), MB. 0 where it has ended."""
-    total = 0.0
-    for member in [pid, *descendants(pid)]:
-        try:
-            rollup = Path(f"/proc/{member}/smaps_rollup").read_text()
-        except OSError:
-            continue
-        total += sum(int(line.split()[1]) for line in rollup.splitlines() if line.startswith("Pss:")) / 1024
-    return total
-
-
-def descendants(pid: int) -> list[int]:
-    """Processes that a process has started, and those that they have."""
-    try:
-        children = [int(text) for task in Path(f"/proc/{pid}/task").iterdir() for text in (task / "children").read_text().split()]
-    except OSError:
-        return []
-    return [member for child in children for member in (child, *descendants(child))]

@@ -18,8 +18,9 @@ from rclpy.executors import SingleThreadedExecutor
 
 from thegra_core.config import ThegraConfig
 from thegra_core.errors import InputError
+from thegra_core.evaluation.benchmark.memory import resident_mb
 from thegra_ros.benchmark.latency import GRAPHS
-from thegra_ros.benchmark.processes import NAMESPACE, end, resident_mb, running
+from thegra_ros.benchmark.processes import NAMESPACE, end, running
 from thegra_ros.qos import RELIABLE
 
 SAMPLE_S = 1.0

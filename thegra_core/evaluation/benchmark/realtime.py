@@ -72,7 +72,7 @@ def markdown(content: Mapping[str, Any]) -> str:
     text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
     settings = f"With {', '.join(content['assignments'])}. " if content["assignments"] else ""
     told = (
-        f"{settings}Latency: from the frame's delivery to its pose. Frame: the work on it. CPU: of all processes. Dropped frames count as not tracked. ATE: after Sim(3) "
+        f"{settings}Latency: from the frame's delivery to its pose. Frame: the work on it. CPU: of all processes. Memory: of all processes together, what they share counted once. Dropped frames count as not tracked. ATE: after Sim(3) "
         f"alignment, of the finished map; live: as estimated at the time. "
         f"Thegra {content['version']}, {described(content['machine'])}."
     )
@@ -97,7 +97,7 @@ def _row(result: Mapping[str, Any]) -> tuple[str, ...]:
         result["recording"], result["profile"], f"{100 * live['dropped_frames'] / max(live['frames_total'], 1):.1f}", _percentiles(live["latency_ms"]),
         f"{live['cpu_s_per_frame']:.3f}", _percentiles(live["ms"].get("total")), ", ".join(f"{stage} {_percentiles(ms)}" for stage, ms in stages.items()) or "–",
         f"{live['tracked_pct']:.1f}", f"{offline['tracked_pct']:.1f}" if offline else "–", _error(live, "ate_rmse"), _error(live, "ate_live_rmse"),
-        _error(offline, "ate_rmse"), f"{live['peak_rss_mb']:.0f}",
+        _error(offline, "ate_rmse"), f"{live['peak_mb']:.0f}",
     )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from thegra_core.config import load_config, parse_assignments
 from thegra_core.errors import InputError
 from thegra_core.evaluation.benchmark.machine import machine
+from thegra_core.evaluation.benchmark.memory import PeakMemory
 from thegra_core.evaluation.benchmark.peers import best_peer, median_or_none
 from thegra_core.evaluation.scores import read_intervals, read_stamps
 from thegra_core.evaluation.tasks import RAN, run_process
@@ -29,7 +30,7 @@ from thegra_core.outputs.trajectory import Trajectory, read_tum
 from thegra_core.sources.open import open_recording
 from thegra_core.version import VERSION
 
-_FROM_METRICS = ("frames_total", "maps", "losses", "relocalizations", "loops", "shutter_closures", "keyframes", "landmarks", "finish_s", "cached_pct", "peak_rss_mb")
+_FROM_METRICS = ("frames_total", "maps", "losses", "relocalizations", "loops", "shutter_closures", "keyframes", "landmarks", "finish_s", "cached_pct")
 _COUNTED = ("tracked_pct", "recall_1pct")
 """Figures for which a frame without a pose is a miss already."""
 _STILL = 1e-6
@@ -138,11 +139,12 @@ def execute(run: PlannedRun, plan: Plan) -> RunResult:
     for stale in (*run.folder.glob("*.json"), *run.folder.glob("*.txt")):
         stale.unlink()
     threads = max(1, (os.cpu_count() or 1) // plan.workers) if plan.workers > 1 else 0
-    code, said = run_process(command(run, plan), threads)
+    memory = PeakMemory()
+    code, said = run_process(command(run, plan), threads, memory)
     if code not in RAN or not (run.folder / "metrics.json").is_file():
         return RunResult(run, code, {}, said or f"exit code {code}")
     try:
-        return RunResult(run, code, figures_of(run))
+        return RunResult(run, code, figures_of(run) | {"peak_mb": round(memory.mb, 1)})
     except InputError as error:
         return RunResult(run, code, {}, str(error))
 
@@ -238,7 +240,7 @@ def summarize(results: Sequence[RunResult]) -> dict[str, Any]:
     for key in ("maps", "losses", "poses", "extent", "in_closure"):
         summary[key] = [r.figures.get(key) for r in results]
     summary |= {key: ran[0].get(key) if ran else None for key in ("truth", "spread", "s_per_frame", "cached_pct", "fps", "ms_stages")}
-    summary["peak_rss_mb"] = max((f["peak_rss_mb"] for f in ran), default=None)
+    summary["peak_mb"] = max((f["peak_mb"] for f in ran), default=None)
     summary["runs"] = [{"seed": r.run.seed, "folder": str(r.run.folder), "exit_code": r.exit_code} | dict(r.figures) for r in results]
     return summary
 

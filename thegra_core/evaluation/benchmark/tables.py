@@ -60,7 +60,7 @@ def _row(s: Mapping[str, Any]) -> list[str]:
     path, live, recall = (_median(s[key], form) if moving else "–" for key, form in (("ate_pct", "{:.2g} %"), ("ate_live_rmse", "{:.3g}"), ("recall_1pct", "{:.1f}")))
     fps = f"{s['fps']:.2g}" if s["fps"] else "–"
     return [
-        name, s["profile"], _tracked(s), _error(s), _relative(s), path, live, recall, _each(s["maps"]), _each(s["losses"]), _time(s), fps, _stages(s), f"{s['peak_rss_mb']:.0f}",
+        name, s["profile"], _tracked(s), _error(s), _relative(s), path, live, recall, _each(s["maps"]), _each(s["losses"]), _time(s), fps, _stages(s), f"{s['peak_mb']:.0f}",
     ]  # fmt: skip
 
 
