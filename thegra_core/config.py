@@ -303,6 +303,7 @@ class BundleConfig(Section):
     local_keyframes: int = Field(20, ge=2, description="keyframes optimised with the new one; a window of 12 drifts more in scale where keyframes follow each other closely (measured)")
     fixed_keyframes: int = Field(20, ge=1, description="outer keyframes kept fixed at the most")
     iterations: int = Field(10, ge=1, description="Levenberg-Marquardt steps a stage")
+    local_solver: Literal["gtsam", "schur"] = Field("gtsam", description="of local adjustments; schur: compiled, dense in the keyframes, a fraction of the time")
     tolerance: float = Field(1e-4, gt=0, description="a step that lessens the cost by a smaller share ends a stage of a local adjustment")
     full_iterations: int = Field(30, ge=1, description="steps of the full adjustment at the end")
     full_tolerance: float = Field(1e-5, gt=0, description="the same of the full adjustment")

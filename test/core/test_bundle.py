@@ -9,9 +9,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from thegra_core.geometry import poses
-from thegra_core.optimization.bundle import BundleProblem, bundle_adjust, squared_errors
+from thegra_core.optimization import bundle
+from thegra_core.optimization.bundle import MINIMIZERS, BundleProblem, BundleResult, squared_errors
 
 FOCAL, HUBER, CHI2 = 400.0, 2.447, 5.991
+
+
+@pytest.fixture(params=sorted(MINIMIZERS), autouse=True)
+def solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Every test holds for each solver."""
+    monkeypatch.setattr(bundle_adjust, "solver", request.param, raising=False)
+    return str(request.param)
+
+
+def bundle_adjust(task: BundleProblem, huber_px: float, chi2_px2: float, iterations: int) -> BundleResult:
+    return bundle.bundle_adjust(task, huber_px, chi2_px2, iterations, solver=bundle_adjust.solver)  # type: ignore[attr-defined]
 
 
 def problem(seed: int = 0, views: int = 4, count: int = 40, noise_px: float = 0.5, fixed: int = 1, start: float = 0.01, weights: str = "grid") -> BundleProblem:
@@ -89,9 +101,9 @@ def test_weights_matter() -> None:
         assert np.median(errors[mine]) < np.median(errors[~mine])
 
 
-def test_weights_between_the_grid_are_at_most_a_tenth_off() -> None:
+def test_weights_between_the_grid_of_the_graph_are_at_most_a_tenth_off() -> None:
     task = problem(seed=3, fixed=2, noise_px=1.0)
-    on_grid, beside = bundle_adjust(task, HUBER, 1e6, 30), bundle_adjust(replace(task, weights=1.08 * task.weights), HUBER, 1e6, 30)
+    on_grid, beside = (bundle.bundle_adjust(t, HUBER, 1e6, 30, solver="gtsam") for t in (task, replace(task, weights=1.08 * task.weights)))
     np.testing.assert_array_equal(on_grid.world_from_camera, beside.world_from_camera)
 
 
@@ -222,3 +234,14 @@ def test_repetition_gives_the_same_bytes() -> None:
     task = problem(seed=14, views=8, count=200, noise_px=1.0)
     results = [bundle_adjust(task, HUBER, CHI2, 15) for _ in range(3)]
     assert len({r.world_from_camera.tobytes() + r.points_world.tobytes() + r.outliers.tobytes() for r in results}) == 1
+
+
+def test_the_solvers_agree() -> None:
+    """With wrong matches, and weights beside the grid only one of them has: the same observations are outliers, and the scene is the same."""
+    task = problem(seed=15, views=8, count=200, noise_px=0.3, fixed=2, start=0.02)
+    normalized = task.normalized.copy()
+    normalized[::23] += 30 / FOCAL
+    by_graph, by_schur = (bundle.bundle_adjust(replace(task, normalized=normalized), HUBER, CHI2, 50, 1e-9, name) for name in ("gtsam", "schur"))
+    np.testing.assert_array_equal(by_graph.outliers, by_schur.outliers)
+    np.testing.assert_allclose(by_graph.world_from_camera, by_schur.world_from_camera, atol=1e-4)
+    np.testing.assert_allclose(by_graph.points_world, by_schur.points_world, atol=2e-3)

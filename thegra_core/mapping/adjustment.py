@@ -46,7 +46,7 @@ def adjust_locally(editor: MapEditor, keyframe_id: int, config: ThegraConfig) ->
     if not outer:  # the whole map is local: its oldest keyframe holds the frame
         outer = [min(local)]
         local = [i for i in local if i not in outer]
-    _solve(editor, _adjustment(editor, sorted(local), sorted(outer), landmarks, config, config.bundle.iterations, config.bundle.tolerance))
+    _solve(editor, _adjustment(editor, sorted(local), sorted(outer), landmarks, config, config.bundle.iterations, config.bundle.tolerance, config.bundle.local_solver))
 
 
 def adjust_all(editor: MapEditor, config: ThegraConfig) -> None:
@@ -71,8 +71,9 @@ def _solve(editor: MapEditor, adjustment: Adjustment | None) -> None:
 
 
 def _adjustment(
-    editor: MapEditor, free: list[int], fixed: list[int], landmarks: IntArray, config: ThegraConfig, iterations: int, tolerance: float
-) -> Adjustment | None:
+    editor: MapEditor, free: list[int], fixed: list[int], landmarks: IntArray, config: ThegraConfig, iterations: int, tolerance: float,
+    solver: str = "gtsam",
+) -> Adjustment | None:  # fmt: skip
     if not free or len(landmarks) == 0:
         return None
     keyframe_ids = np.array([*free, *fixed], dtype=np.int64)
@@ -97,4 +98,4 @@ def _adjustment(
         weights=weights,
         focal=editor.map.camera.focal,
     )
-    return Adjustment(keyframe_ids, landmarks, observer, feature, BundleTask(problem, config.bundle.huber_px, config.bundle.chi2_px2, iterations, tolerance))
+    return Adjustment(keyframe_ids, landmarks, observer, feature, BundleTask(problem, config.bundle.huber_px, config.bundle.chi2_px2, iterations, tolerance, solver))

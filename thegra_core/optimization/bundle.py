@@ -1,32 +1,24 @@
-"""Bundle adjustment of keyframes and points (paper Sec. III-C, III-D) on gtsam's C++ factors.
-
-gtsam holds the interpreter's lock for a whole solve: a live system runs this in the mapping process.
-"""
+"""Bundle adjustment of keyframes and points (paper Sec. III-C, III-D): what takes part, in which order, and what is an outlier."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import P, X
 from numpy.typing import NDArray
 
 from thegra_core.geometry import poses
+from thegra_core.optimization.factor_graph import FactorGraph
+from thegra_core.optimization.schur import SchurSystem
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-FIXED_SIGMA = 1e-6
-"""Standard deviation (rad, map units) of the fixed pose from which a free scale is held; other fixed poses are no variables."""
-SCALE_SIGMA = 0.1
-"""Standard deviation, in its own length, of the distance that holds a free scale. Nothing in the images speaks against it, so a loose one holds as
-well as a tight one; a tight one would let the poses move only along a sphere and stop every step that is larger than its width."""
 GROSS = 16.0
 """Times the gate, or the median if that is more: squared errors at the start that are no error of the start."""
-WEIGHT_STEPS_PER_OCTAVE = 4
-"""Weights share noise models on a logarithmic grid this fine: a model for each observation would double the time to build the graph."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,18 +46,38 @@ class BundleResult:
     squared_errors: FloatArray
 
 
-def bundle_adjust(problem: BundleProblem, huber_px: float, chi2_px2: float, iterations: int, tolerance: float = 1e-5) -> BundleResult:
+class Minimizer(Protocol):
+    """Minimises the weighted Huber cost of a problem's observations."""
+
+    def minimize(
+        self, world_from_camera: FloatArray, points_world: FloatArray, used: BoolArray, keyframe_rows: IntArray, point_rows: IntArray,
+        scale_from: tuple[int, int] | None, iterations: int, tolerance: float,
+    ) -> tuple[FloatArray, FloatArray] | None:  # fmt: skip
+        """Poses (K, 4, 4) and points (P, 3) from where they start, None where that is indeterminate.
+
+        Only observations `used` (M,) count, those of `keyframe_rows` and `point_rows`. scale_from: rows of the only fixed pose and of a free one, whose
+        distance may hold the scale, which is free then and is restored by the caller.
+        """
+
+
+MINIMIZERS: dict[str, Callable[[BundleProblem, float], Minimizer]] = {"gtsam": FactorGraph, "schur": SchurSystem}
+"""By name: gtsam's factor graph, for any number of keyframes; the compiled Schur complement, for tens."""
+
+
+def bundle_adjust(
+    problem: BundleProblem, huber_px: float, chi2_px2: float, iterations: int, tolerance: float = 1e-5, solver: str = "gtsam"
+) -> BundleResult:
     """Minimise Huber(e^T Omega e) over poses and points in two stages; outliers are left out of the second and marked again at the end.
 
     A stage ends after `iterations` steps (the first after half of them), or when a step lessens the cost by less than its share `tolerance`.
 
-    A solve that gtsam gives up on (an indeterminate system) returns the problem's own poses and points.
+    solver: One of `MINIMIZERS`. A solve that is given up (an indeterminate system) returns the problem's own poses and points.
     """
     used = ~_outliers(problem, problem.world_from_camera, problem.points_world, _gross(problem, chi2_px2))
     camera, points = problem.world_from_camera, problem.points_world
-    factors = _projections(problem, huber_px)
+    minimizer = MINIMIZERS[solver](problem, huber_px)
     for stage_iterations in (max(iterations // 2, 1), iterations):
-        camera, points = _solve(problem, factors, camera, points, used, stage_iterations, tolerance)
+        camera, points = _solve(problem, minimizer, camera, points, used, stage_iterations, tolerance)
         used = ~_outliers(problem, camera, points, chi2_px2)
     errors = squared_errors(problem, camera, points)
     return BundleResult(camera, points, ~used, errors)
@@ -94,13 +106,7 @@ def _gross(problem: BundleProblem, chi2_px2: float) -> float:
 
 
 def _solve(
-    problem: BundleProblem,
-    factors: list[gtsam.NonlinearFactor],
-    world_from_camera: FloatArray,
-    points_world: FloatArray,
-    used: BoolArray,
-    iterations: int,
-    tolerance: float,
+    problem: BundleProblem, minimizer: Minimizer, world_from_camera: FloatArray, points_world: FloatArray, used: BoolArray, iterations: int, tolerance: float
 ) -> tuple[FloatArray, FloatArray]:
     seen = np.bincount(problem.point_index[used], minlength=len(points_world))
     used = used & (seen[problem.point_index] >= 2)
@@ -108,39 +114,13 @@ def _solve(
     keyframe_rows = np.flatnonzero(np.bincount(problem.keyframe_index[used], minlength=len(world_from_camera)))
     if len(point_rows) == 0 or bool(np.all(problem.fixed[keyframe_rows])):
         return world_from_camera, points_world
-
-    graph, values, ordering = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Ordering()
-    for row in point_rows:
-        values.insert(P(int(row)), points_world[row])
-        ordering.push_back(P(int(row)))
-    for row in keyframe_rows[~problem.fixed[keyframe_rows]]:
-        values.insert(X(int(row)), gtsam.Pose3(world_from_camera[row]))
-        ordering.push_back(X(int(row)))
     scale_from = _scale_baseline(world_from_camera, problem.fixed, keyframe_rows)
-    if scale_from is not None:
-        _hold_scale(graph, values, ordering, world_from_camera, *scale_from)
-    for m in np.flatnonzero(used).tolist():
-        graph.push_back(factors[m])
-
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setOrdering(ordering)
-    parameters.setMaxIterations(iterations)
-    parameters.setRelativeErrorTol(tolerance)
-    parameters.setLinearSolverType("SEQUENTIAL_CHOLESKY")  # the same result; measured: 11 to 17 % less time than the multifrontal default
-    try:
-        result = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    except RuntimeError:  # gtsam.IndeterminantLinearSystemException: a point or pose without enough constraints
+    found = minimizer.minimize(world_from_camera, points_world, used, keyframe_rows, point_rows, scale_from, iterations, tolerance)
+    if found is None:
         return world_from_camera, points_world
-
-    camera, points = world_from_camera.copy(), points_world.copy()
-    for row in keyframe_rows:
-        if not problem.fixed[row]:
-            camera[row] = result.atPose3(X(int(row))).matrix()
-    for row in point_rows:
-        points[row] = result.atPoint3(P(int(row)))
     if scale_from is not None:
-        _restore_scale(world_from_camera, camera, points, keyframe_rows, point_rows, *scale_from)
-    return camera, points
+        _restore_scale(world_from_camera, *found, keyframe_rows, point_rows, *scale_from)
+    return found
 
 
 def _scale_baseline(world_from_camera: FloatArray, fixed: BoolArray, keyframe_rows: IntArray) -> tuple[int, int] | None:
@@ -153,18 +133,6 @@ def _scale_baseline(world_from_camera: FloatArray, fixed: BoolArray, keyframe_ro
     return (int(held[0]), int(keyframe_rows[far])) if distance[far] > 0 else None
 
 
-def _hold_scale(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, world_from_camera: FloatArray, held: int, far: int
-) -> None:
-    """Add the held pose as a variable, for the distance to it to be a factor; its observations do not need it."""
-    pose = gtsam.Pose3(world_from_camera[held])
-    values.insert(X(held), pose)
-    ordering.push_back(X(held))
-    graph.add(gtsam.PriorFactorPose3(X(held), pose, gtsam.noiseModel.Isotropic.Sigma(6, FIXED_SIGMA)))
-    distance = float(np.linalg.norm(world_from_camera[far, :3, 3] - world_from_camera[held, :3, 3]))
-    graph.add(gtsam.RangeFactorPose3(X(held), X(far), distance, gtsam.noiseModel.Isotropic.Sigma(1, SCALE_SIGMA * distance)))
-
-
 def _restore_scale(
     before: FloatArray, camera: FloatArray, points: FloatArray, keyframe_rows: IntArray, point_rows: IntArray, held: int, far: int
 ) -> None:
@@ -174,23 +142,3 @@ def _restore_scale(
     free = keyframe_rows[keyframe_rows != held]
     camera[free, :3, 3] = center + factor * (camera[free, :3, 3] - center)
     points[point_rows] = center + factor * (points[point_rows] - center)
-
-
-def _projections(problem: BundleProblem, huber_px: float) -> list[gtsam.NonlinearFactor]:
-    """A factor for each observation; those of fixed keyframes concern their point alone."""
-    calibration = gtsam.Cal3_S2(problem.focal, problem.focal, 0.0, 0.0, 0.0)
-    kernel = gtsam.noiseModel.mEstimator.Huber.Create(huber_px)
-    steps = np.round(WEIGHT_STEPS_PER_OCTAVE * np.log2(np.maximum(problem.weights, 1e-12))).astype(int)
-    models = {
-        int(step): gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Isotropic.Sigma(2, float(2.0 ** (-0.5 * step / WEIGHT_STEPS_PER_OCTAVE))))
-        for step in np.unique(steps)
-    }
-    fixed = {int(row): gtsam.PinholeCameraCal3_S2(gtsam.Pose3(problem.world_from_camera[row]), calibration) for row in np.flatnonzero(problem.fixed)}
-    measured = problem.focal * problem.normalized
-    observations = zip(problem.keyframe_index.tolist(), problem.point_index.tolist(), steps.tolist(), measured, strict=True)
-    return [
-        gtsam.TriangulationFactorCal3_S2(fixed[row], pixel, models[step], P(point))
-        if row in fixed
-        else gtsam.GenericProjectionFactorCal3_S2(pixel, models[step], X(row), P(point), calibration)
-        for row, point, step, pixel in observations
-    ]

@@ -45,7 +45,7 @@ def _normal_equations(
 
 
 @_compile
-def _perturbed(pose: FloatArray, step: FloatArray) -> FloatArray:
+def perturbed(pose: FloatArray, step: FloatArray) -> FloatArray:
     """The pose after a left perturbation (rotation vector, translation); Rodrigues' formula."""
     w = step[:3]
     angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -87,7 +87,7 @@ def minimize_reprojection(
             break
         hessian = normal
         step = -np.linalg.solve(hessian + _DAMPING * np.trace(hessian) * np.eye(6), gradient)
-        pose = _perturbed(pose, step)
+        pose = perturbed(pose, step)
         if np.abs(step).max() < _CONVERGED:
             break
     return pose, hessian

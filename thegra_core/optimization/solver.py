@@ -25,10 +25,11 @@ class BundleTask:
     chi2_px2: float
     iterations: int
     tolerance: float
+    solver: str = "gtsam"
 
     def solve(self) -> BundleResult:
         """The adjustment, in this thread."""
-        return bundle_adjust(self.problem, self.huber_px, self.chi2_px2, self.iterations, self.tolerance)
+        return bundle_adjust(self.problem, self.huber_px, self.chi2_px2, self.iterations, self.tolerance, self.solver)
 
 
 class PendingBundle(Protocol):
