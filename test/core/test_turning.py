@@ -11,9 +11,11 @@ from synthetic import CAMERA, FakeMatcher, look, make_world, observe, stamp
 from test_slam import ate, play
 
 from thegra_core.config import ThegraConfig, load_config
+from thegra_core.features.registry import make_frame_matcher
 from thegra_core.features.turning import TurningMatcher, turned_features, turned_pixels
 from thegra_core.mapping.mapper import Mapper
-from thegra_core.messages import Features, Frame, Matches, TrackingState
+from thegra_core.mapping.service import InlineMapping
+from thegra_core.messages import Features, Frame, MapUpdate, Matches, TrackingState
 from thegra_core.slam import Slam
 
 WIDTH, HEIGHT = CAMERA.image_size
@@ -225,3 +227,53 @@ def test_after_a_turn_that_is_filmed_images_lie_as_before(rotations: str, loops:
     upright = sum(turns == 0 for turns in extractor.asked)
     assert upright == len(path) if rotations == "[]" else upright < 35
     assert len(extractor.asked) <= len(path) + 4, "the other orientation is not looked for in vain"
+
+
+class LateMapping(InlineMapping):
+    """Answers some looks of tracking later; there are two a frame."""
+
+    def __init__(self, mapper: Mapper, looks: int = 3) -> None:
+        super().__init__(mapper)
+        self._waiting: list[list[MapUpdate]] = [[] for _ in range(looks)]
+
+    def updates(self) -> list[MapUpdate]:
+        self._waiting.append(super().updates())
+        return self._waiting.pop(0)
+
+    def finish(self) -> list[MapUpdate]:
+        late, self._waiting = [update for part in self._waiting for update in part], []
+        return [*late, *super().finish()]
+
+
+def on_the_spot(along: int, turn: int) -> list[np.ndarray]:
+    """Along x, a half turn that is filmed, and back."""
+    there = [look((0.15 * i, 0.02 * np.sin(i), 0.0)) for i in range(along)]
+    turning = [look((0.15 * along, 0.02 * i, 0.0), roll_deg=180 * i / turn) for i in range(turn)]
+    return [*there, *turning, *(look((0.15 * i, 0.3, 0.0), roll_deg=180) for i in range(along, 0, -1))]
+
+
+def test_images_are_turned_back_while_mapping_is_behind() -> None:
+    path = on_the_spot(12, 18)
+    extractor, settings = FieldExtractor(path), config("[90, 180, 270]")
+    slam = Slam(CAMERA, settings, extractor, LooseMatcher(), mapping=LateMapping(Mapper(CAMERA, settings, make_frame_matcher(settings, LooseMatcher()))))
+    results, run = play(slam, marked_frames(len(path)))
+    assert (len(run.maps), run.losses, run.relocalizations) == (1, 0, 0)
+    assert {r.state for r in results[8:]} == {TrackingState.TRACKING}
+    assert extractor.asked[-10:] == [2] * 10
+    assert ate(run, path)[0] < 0.005
+
+
+def test_a_map_that_stays_as_it_is_turns_images_back(tmp_path: Path) -> None:
+    path = on_the_spot(12, 18)
+    first = Slam(CAMERA, config("[90, 180, 270]"), FieldExtractor(path), LooseMatcher())
+    for frame in marked_frames(13):
+        first.process(frame)
+    first.save_map(tmp_path / "field.map")
+    extractor = FieldExtractor(path)
+    slam = Slam(CAMERA, config("[90, 180, 270]"), extractor, LooseMatcher())
+    slam.load_map(tmp_path / "field.map")
+    slam.localization_only = True
+    results = [slam.process(frame) for frame in marked_frames(len(path))]
+    assert {r.state for r in results} == {TrackingState.TRACKING}
+    assert extractor.asked[-10:] == [2] * 10
+    assert slam.map_size()[0] == len(Mapper(CAMERA, config("[]"), LooseMatcher()).load(tmp_path / "field.map").new_keyframes)
