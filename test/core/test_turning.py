@@ -111,7 +111,6 @@ class GroundExtractor:
         self._turned = [GROUND.descriptors, *(others / np.linalg.norm(others, axis=2, keepdims=True))]
 
     def extract(self, image: np.ndarray, stamp_ns: int) -> Features:
-        corners = [image[:_MARK, :_MARK], image[:_MARK, -_MARK:], image[-_MARK:, -_MARK:], image[-_MARK:, :_MARK]]
         turns = turns_of(image)
         pose = self.path[(stamp_ns - stamp(0)) // (stamp(1) - stamp(0))]
         quarter = (round(np.degrees(np.arctan2(pose[1, 0], pose[0, 0])) / 90) + turns) % 4
