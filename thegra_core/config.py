@@ -340,7 +340,7 @@ class LoopConfig(Section):
     max_scale_spread: float = Field(0.1, gt=0, description="median deviation of the logarithm of their depths' ratio")
     max_rotation_deg: float = Field(3.0, gt=0, description="degrees by which a second keyframe may place the loop otherwise")
     max_translation_ratio: float = Field(0.1, gt=0, description="the same in position, over the median depth")
-    rotations: tuple[Literal[90, 180, 270], ...] = Field((), description="degrees by which the image of a frame that is not found is turned, for cameras that look at the ground and turn between two frames; each costs an extraction and the matches of such a frame, until a new map may begin")
+    rotations: tuple[Literal[90, 180, 270], ...] = Field((), description="degrees by which the image of a frame that is not found is turned, and from when on all are where a tracked camera has rolled: for cameras that look at the ground and turn; each costs an extraction and the matches of a frame that is not found, until a new map may begin")
     full_adjustment_after: int = Field(3, ge=1, description="keyframes after a loop or a merge from which on the result of the full adjustment is taken")
 
 

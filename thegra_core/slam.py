@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -110,7 +111,6 @@ class Slam:
         self._shutter = ShutterDetector(config.preprocessing.shutter)
         self._fixed_pattern = FixedPatternMask()
         self._masks = config.tracking.mask_fixed_pattern
-        self._rotations = config.loop.rotations
         self._extractor = TurnableExtractor(extractor if extractor is not None else make_extractor(config.extractor))
         configured = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
         quick = Nearest(config.matcher) if config.tracking.match_by == "nearest" else None
@@ -268,6 +268,10 @@ class Slam:
             self._take_updates()  # of keyframes that came before: this frame needs their landmarks
             for keyframe in self._tracking.catch_up():
                 self._mapping.insert(keyframe)
+        if self._extractor.turns != self._tracking.turns:  # nothing that was found in images turned otherwise is followed on
+            self._extractor.turns = self._tracking.turns
+            self._front_end.forget()
+            followed = self._front_end.follow(image, frame.stamp_ns)
         reference = self._tracking.reference_features
         features, output = self._front(image, frame.stamp_ns, followed, reference)
         if output.dropped_map_id is not None:
@@ -281,10 +285,9 @@ class Slam:
         self._snapshots.offer(frame.index, self._view)
         return output
 
-    def _otherwise(self, image: NDArray[np.uint8], stamp_ns: int) -> Iterator[Features]:
-        """The features of the other orientations, each found when it is asked for."""
-        for degrees in self._rotations:
-            yield self._fixed_pattern.apply(self._extractor.turned(image, stamp_ns, degrees // 90))
+    def _turned(self, image: NDArray[np.uint8], stamp_ns: int, turns: int) -> Features:
+        """The features of the image turned by so many quarter turns."""
+        return self._fixed_pattern.apply(self._extractor.turned(image, stamp_ns, turns - self._extractor.turns))
 
     def _front(
         self, image: NDArray[np.uint8], stamp_ns: int, followed: Features | None, reference: Features | None
@@ -305,12 +308,8 @@ class Slam:
         with self._timed("matching"):
             matches = self._unmasked(features, reference, self._matcher.match(features, reference)) if reference is not None else None
         with self._timed("tracking"):
-            output = self._tracking.process(features, matches, self._otherwise(image, stamp_ns))
-        if output.found_turned is not None:
-            features = output.found_turned
-            self._extractor.turns = features.turns
-            self._front_end.forget()
-        return features, output
+            output = self._tracking.process(features, matches, partial(self._turned, image, stamp_ns))
+        return (output.found_turned if output.found_turned is not None else features), output
 
     def _unmasked(self, features: Features, reference: Features, matches: Matches) -> Matches:
         return self._fixed_pattern.learn(features, reference, matches) if self._masks else matches

@@ -50,6 +50,7 @@ def made(other: World) -> tuple[dict[str, Clip], Settings]:
 def test_what_is_joined() -> None:
     assert [joining.title(p) for p in joining.planned(["a", "b", "c"], ("pairs", "back"))] == ["a + b", "a + c", "b + c", "a + a back", "b + b back", "c + c back"]
     assert [joining.title(p) for p in joining.planned(["a", "b", "c"], ("between",))] == ["a + b + a back", "b + c + b back", "c + a + c back"]
+    assert [joining.title(p) for p in joining.planned(["a", "b"], ("turned",))] == ["a + a turn + a back turned", "b + b turn + b back turned"]
     assert joining.planned(["a"], ("pairs", "between")) == []
     with pytest.raises(ConfigError, match="--check loops"):
         places.Plan(("pairs", "loops"))
@@ -86,7 +87,7 @@ def test_a_place_that_is_not_found_again_is_told() -> None:
     """The way back shows another scene under the same name."""
     clips, settings = made(OTHER)
     assert isinstance(settings.extractor, ByImage)
-    plan = (Part("one"), Part("one", backwards=True))
+    plan = (Part("one"), Part("one", "back"))
     elsewhere = Clip("one", CAMERA, clips["two"].frames)
     joined = joining.join([clips["one"], elsewhere.backwards()])
     told = joining.judge(joining.run(joined, settings), plan, joined)

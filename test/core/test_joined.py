@@ -10,8 +10,9 @@ import pytest
 
 from thegra_core.errors import InputError
 from thegra_core.geometry.camera import CameraModel, DistortionModel
+from thegra_core.geometry.poses import so3_exp, transform
 from thegra_core.messages import Frame
-from thegra_core.sources.joined import Clip, View, common_camera, join, read_clip
+from thegra_core.sources.joined import Clip, View, common_camera, join, read_clip, roll_homography
 
 WIDE = CameraModel(np.array([[60.0, 0, 39.5], [0, 60.0, 31.5], [0, 0, 1]]), np.array([-0.2, 0.05, 0.001, -0.001]), DistortionModel.PLUMB_BOB, (80, 64))
 NARROW = CameraModel(np.array([[300.0, 0, 81.0], [0, 300.0, 60.0], [0, 0, 1]]), np.array([0.1, 0, 0, 0]), DistortionModel.PLUMB_BOB, (160, 120))
@@ -33,6 +34,39 @@ def test_clips_follow_each_other_at_the_pace_of_the_first() -> None:
     assert joined.part.tolist() == [0] * 5 + [1] * 4 + [2] * 5
     assert joined.source.tolist() == [0, 3, 6, 9, 12, 9, 6, 3, 0, 0, 3, 6, 9, 12]
     assert joined.camera is WIDE and joined.frames[0].image.dtype == np.uint16
+
+
+def seen(camera: CameraModel, world_from_camera: np.ndarray) -> np.ndarray:
+    """A scene at infinity that is a smooth function of the direction, near the axis at least as wide as the image is high."""
+    width, height = camera.image_size
+    pixels = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1).reshape(-1, 2)
+    rays = camera.bearings(pixels) @ world_from_camera[:3, :3].T
+    x, y = (rays[:, :2] / rays[:, 2:]).T
+    return (3000 + 900 * np.sin(9 * x + 0.3) + 700 * np.cos(7 * y + 0.5 * x)).reshape(height, width).astype(np.uint16)
+
+
+@pytest.mark.parametrize("degrees", [30, 90, 180])
+def test_rolled_images_are_what_a_rolled_camera_sees(degrees: float) -> None:
+    camera = replace(WIDE, matrix=np.array([[60.0, 0, 41.5], [0, 55.0, 30.0], [0, 0, 1]]), distortion=np.array([-0.2, 0.05, 0.0, 0.0]))
+    rolled = so3_exp([0, 0, np.radians(degrees)])  # z is forward, so the camera's right side goes down
+    before, after = seen(camera, np.eye(4)), seen(camera, transform(rolled, np.zeros(3)))
+    turning = Clip("a", camera, (Frame(0, 0, before),)).turning(30.0)
+    image = turning.frames[round(degrees / 30) - 1].image
+    y, x = np.mgrid[: before.shape[0], : before.shape[1]]
+    round_the_axis = np.hypot((x - 41.5) / 60, (y - 30) / 55) < 0.45
+    assert round_the_axis.sum() > 1500
+    error = np.abs(image.astype(float) - after)[round_the_axis]
+    assert error.max() < 10, "of 3200 between dark and bright"
+
+
+def test_a_turn_ends_upside_down_and_numbers_images_as_they_were() -> None:
+    there = clip("there")
+    turn = there.turning()
+    assert len(turn.frames) == 18 and {f.index for f in turn.frames} == {there.frames[-1].index}
+    round_about = there.upside_down()
+    np.testing.assert_array_equal(turn.frames[-1].image, round_about.frames[-1].image)
+    assert [f.index for f in round_about.backwards().frames] == [9, 6, 3, 0]
+    assert turn.frames[0].image.dtype == np.uint16 and not np.array_equal(roll_homography(WIDE, 10), np.eye(3))
 
 
 def test_images_of_two_types_become_one() -> None:

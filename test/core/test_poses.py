@@ -118,3 +118,27 @@ def test_adjoint_carries_small_motions():
         return poses.transform(poses.so3_exp(twist[:3]), twist[3:])
 
     np.testing.assert_allclose(a_from_b @ move(small), move(poses.adjoint(a_from_b) @ small) @ a_from_b, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "swing_deg", "twist_deg"),
+    [
+        (np.eye(3), 0, 0),
+        ([[0, -1, 0], [1, 0, 0], [0, 0, 1]], 0, 90),  # x to y
+        ([[-1, 0, 0], [0, -1, 0], [0, 0, 1]], 0, 180),
+        ([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], 0, -90),
+        ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], 90, 0),  # about x: z goes to -y
+        ([[0, 0, 1], [1, 0, 0], [0, 1, 0]], 90, 90),  # about z by 90 degrees, then about x by 90
+        ([[-1, 0, 0], [0, 1, 0], [0, 0, -1]], 180, 0),  # about y
+    ],
+)
+def test_a_rotation_is_a_twist_about_z_and_then_a_swing(rotation: list[list[int]], swing_deg: float, twist_deg: float) -> None:
+    swing, twist = np.degrees(poses.swing_and_twist(rotation))
+    assert swing == pytest.approx(swing_deg, abs=1e-6)
+    assert (twist - twist_deg + 180) % 360 - 180 == pytest.approx(0, abs=1e-6)
+
+
+@given(st.floats(-3.1, 3.1), st.floats(0, 3.0), st.floats(-3.1, 3.1))
+def test_swing_and_twist_put_together_are_the_rotation(twist: float, swing: float, direction: float) -> None:
+    rotation = poses.so3_exp([swing * np.cos(direction), swing * np.sin(direction), 0]) @ poses.so3_exp([0, 0, twist])
+    np.testing.assert_allclose(poses.swing_and_twist(rotation), (swing, twist), atol=1e-6)

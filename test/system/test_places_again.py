@@ -18,8 +18,8 @@ from thegra_core.sources.joined import read_clip
 TRIALS = 20
 
 
-def profile(name: str) -> Settings:
-    config = load_config(name)
+def profile(name: str, overrides: dict[str, str] | None = None) -> Settings:
+    config = load_config(name, overrides=overrides)
     return Settings(config, make_extractor(config.extractor), make_matcher(config.matcher, config.extractor))
 
 
@@ -44,10 +44,24 @@ def test_the_way_back_stays_in_one_map(shared_data: Path, name: str, every: int)
     """There and back again: every place is seen twice, and is the same place both times."""
     needs(shared_data / name, "quality")
     clip = read_clip(shared_data / name, every)
-    told = joining.run_one({name: clip}, (Part(name), Part(name, backwards=True)), 0.0, profile("quality"))
+    told = joining.run_one({name: clip}, (Part(name), Part(name, "back")), 0.0, profile("quality"))
     assert (told["maps"], told["verdict"]) == (1, "right")
     assert told["found_again_pct"] >= 90
     assert told["apart"] < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(PATIENCE_S)
+def test_the_way_back_after_a_turn_that_is_filmed_is_the_same_place(shared_data: Path) -> None:
+    """A drone turns on the spot and flies back: what it sees is what it saw, upside down."""
+    needs(shared_data / "forest_f0", "fast")
+    clip = read_clip(shared_data / "forest_f0", max_frames=30)
+    (plan,) = joining.planned(["forest_f0"], ("turned",))
+    told = {rotations: joining.run_one({"forest_f0": clip}, plan, 0.0, profile("fast", {"loop.rotations": rotations})) for rotations in ("[90, 180, 270]", "[]")}
+    with_turns, without = told.values()
+    assert (with_turns["maps"], with_turns["tracked_pct"], with_turns["found_again_pct"]) == (1, [100.0, 100.0, 100.0], 100.0)
+    assert with_turns["apart"] < 0.01
+    assert without["verdict"] != "right", "the recording tells nothing"
 
 
 @pytest.mark.slow

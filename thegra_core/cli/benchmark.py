@@ -197,7 +197,7 @@ def places(
     suite: Annotated[bool, typer.Option("--suite", help="Also the fixed simulated suite; what is missing of it is made first.")] = False,
     suite_dir: Annotated[Path, typer.Option(metavar="DIR", help="Where the suite is kept.")] = Path("runs/suite"),
     only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Of the suite only this sequence; repeatable.")] = None,
-    check: Annotated[list[str] | None, typer.Option(metavar="CHECK", help="pairs: two recordings joined; back: one and its way back; between: one, another, and the first one's way back; kidnapped: a map of each, shown frames of its own and of all others. Repeatable. Default: all.")] = None,
+    check: Annotated[list[str] | None, typer.Option(metavar="CHECK", help="pairs: two recordings joined; back: one and its way back; turned: one, half a turn about the optical axis at its end, and the way back upside down, for cameras that look at the ground; between: one, another, and the first one's way back; kidnapped: a map of each, shown frames of its own and of all others. Repeatable. Default: all but turned.")] = None,
     profile: Annotated[str, typer.Option(help="paper, quality, fast or realtime.")] = "quality",
     every: Annotated[int, typer.Option(min=1, metavar="N", help="Use every N-th frame.")] = 1,
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=2, metavar="N", help="Frames of each recording at the most.")] = None,
@@ -228,7 +228,7 @@ def places(
 
     config = load_config(profile, overrides=parse_assignments(set_ or ()))
     set_threads(config.threads)
-    plan = logic.Plan(tuple(check or logic.CHECKS), gap, trials, shown, tuple(set_ or ()))
+    plan = logic.Plan(tuple(check or logic.USUAL), gap, trials, shown, tuple(set_ or ()))
     paths = [*(recordings or ()), *(_suite(suite_dir, only) if suite else [])]
     if not paths:
         raise InputError("nothing to join: name recordings, or add --suite for the simulated ones")

@@ -46,6 +46,17 @@ def rotation_angle(rotation: ArrayLike) -> float:
     return float(np.linalg.norm(so3_log(rotation)))
 
 
+def swing_and_twist(rotation: ArrayLike) -> tuple[float, float]:
+    """Angles in radians of a rotation matrix (3, 3) taken apart into a twist about z and, after it, a swing about an axis in the plane of x and y.
+
+    The swing, in [0, pi], is the angle between the z axes; the twist is in (-pi, pi], and means nothing where the swing is half a turn.
+    """
+    _, _, z, w = quaternion_from_rotation(rotation)
+    twist = 2.0 * np.arctan2(z, w)
+    cosine = np.asarray(rotation, dtype=np.float64)[2, 2]
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0))), float(twist)
+
+
 def quaternion_from_rotation(rotation: ArrayLike) -> FloatArray:
     """Unit quaternion (x, y, z, w) with w >= 0 of a rotation matrix (3, 3) (Shepperd 1978: the largest component first)."""
     r = np.asarray(rotation, dtype=np.float64)

@@ -13,6 +13,7 @@ from thegra_core.features.protocols import Matcher
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.editor import MapEditor
 from thegra_core.map.map import Map, summarize
+from thegra_core.map.orientation import lie_alike
 from thegra_core.mapping import culling
 from thegra_core.mapping.adjustment import adjust_all, adjust_locally
 from thegra_core.mapping.chaining import MatchGraph
@@ -247,17 +248,20 @@ class Mapper:
         self._trial[keyframe.map_id].extend(range(before, editor.next_landmark))
 
     def _choose_neighbours(self, editor: MapEditor, keyframe: Keyframe) -> list[int]:
-        """Covisible keyframes to match: those that share much and stand far enough apart for new points to have parallax.
+        """Covisible keyframes to match: those that lie alike, share much and stand far enough apart for new points to have parallax.
 
         A neighbour counts by the landmarks it shares, less in proportion the shorter its baseline is than `good_baseline_ratio` of the scene's depth: where
         keyframes follow each other closely, the nearest share most and tell least.
         """
         settings = self._config.mapping
         depth = editor.map.median_depth(keyframe.id)
-        center = editor.map.keyframes[keyframe.id].center
+        center, turns = editor.map.keyframes[keyframe.id].center, keyframe.features.turns
         good = settings.good_baseline_ratio * depth if np.isfinite(depth) else 0.0
         worth = []
         for other, shared in editor.map.covisibility.get(keyframe.id, ()):
-            baseline = float(np.linalg.norm(editor.map.keyframes[other].center - center))
+            neighbour = editor.map.keyframes[other]
+            if not lie_alike(neighbour, keyframe.world_from_camera, turns):
+                continue
+            baseline = float(np.linalg.norm(neighbour.center - center))
             worth.append((shared * min(1.0, baseline / good) if good > 0 else float(shared), other))
         return [other for _, other in sorted(worth, reverse=True)[: settings.neighbours]]

@@ -11,11 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.errors import InputError
+from thegra_core.geometry import poses
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame, ImageArray
 from thegra_core.sources.open import camera_for, open_recording
 
+FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+TURN_STEP_DEG = 10.0
+"""Roll from frame to frame of a turn that is filmed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +38,15 @@ class Clip:
     def backwards(self) -> Clip:
         """The way back: the same images in the opposite order, without the last one, where it begins."""
         return replace(self, frames=self.frames[-2::-1])
+
+    def turning(self, step_deg: float = TURN_STEP_DEG) -> Clip:
+        """The camera turns half round about its optical axis where the clip ends: the last image, rolled by `step_deg` more from frame to frame."""
+        steps = round(180 / step_deg)
+        return replace(self, frames=tuple(_rolled(self.frames[-1], self.camera, 180 * step / steps) for step in range(1, steps + 1)))
+
+    def upside_down(self) -> Clip:
+        """The same frames by a camera that is turned half round about its optical axis."""
+        return replace(self, frames=tuple(_rolled(frame, self.camera, 180) for frame in self.frames))
 
     def seen_by(self, camera: CameraModel) -> Clip:
         """The same frames as another camera at the same places would have shown them."""
@@ -104,6 +117,22 @@ class View:
         smooth = cv2.GaussianBlur(image, (0, 0), self._blur_px) if self._blur_px > 0 else image
         seen: ImageArray = cv2.remap(smooth, self._where[..., 0], self._where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
         return seen
+
+
+def roll_homography(camera: CameraModel, degrees: float) -> FloatArray:
+    """Pixels (3, 3), homogeneous, before to after a camera rolls about its optical axis, clockwise as it looks.
+
+    Rays turn about the axis of the lens, so it holds with radial distortion, too; tangential distortion is taken for none.
+    """
+    back = np.eye(3)
+    back[:2, :2] = poses.so3_exp([0.0, 0.0, -np.radians(degrees)])[:2, :2]
+    return np.asarray(camera.matrix @ back @ np.linalg.inv(camera.matrix))
+
+
+def _rolled(frame: Frame, camera: CameraModel, degrees: float) -> Frame:
+    """What is beyond the image's edge is its mirror image."""
+    turned = cv2.warpPerspective(frame.image, roll_homography(camera, degrees), camera.image_size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    return replace(frame, image=turned)  # type: ignore[arg-type]
 
 
 def common_camera(cameras: Sequence[CameraModel]) -> CameraModel:

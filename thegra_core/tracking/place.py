@@ -22,7 +22,8 @@ class Place:
     """Where tracking is: a replica of a map and of its places, keyframes of it, and what has been seen since the last one.
 
     resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet, and
-    their poses. awaited_since_ns: stamp after which frames came while mapping made the map, until they have been looked at.
+    their poses. awaited_since_ns: stamp after which frames came while mapping made the map, until they have been looked at. turns: quarter turns
+    counter-clockwise by which images are turned before features are looked for in them, so that they lie as the map's first one does.
     """
 
     map: Map
@@ -39,6 +40,7 @@ class Place:
     tracks: TrackLandmarks = field(default_factory=TrackLandmarks)
     pending: dict[int, FloatArray] = field(default_factory=dict)
     awaited_since_ns: int | None = None
+    turns: int = 0
 
     @property
     def begun(self) -> bool:

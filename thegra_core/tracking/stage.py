@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +15,7 @@ from thegra_core.geometry import poses
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.map import Map
+from thegra_core.map.orientation import lie_alike
 from thegra_core.messages import (
     NO_LANDMARK,
     Absorbed,
@@ -35,6 +35,7 @@ from thegra_core.tracking.keyframe_policy import needs_keyframe
 from thegra_core.tracking.place import Place
 from thegra_core.tracking.relocalizer import doubt_of, evidence, last_keyframes, nearest_in_time, relocalize, similar_keyframes
 from thegra_core.tracking.tracker import FrameView, Localization, best_reference, localize
+from thegra_core.tracking.turning import FoundTurned, Turned, turn_back
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -47,8 +48,7 @@ class TrackingOutput:
 
     While a new map is on probation nothing is claimed: `result` has no pose, and `provisional` is the result that holds if the map stands.
     `dropped_map_id` names a map that did not stand. landmark_ids (N,) per keypoint and the matches used are for viewers; None where there are none.
-    found_turned: the frame's features of another orientation, by which it was found; landmark_ids and matches are theirs, and the next frames had better be
-    turned alike.
+    found_turned: the frame's features of another orientation, by which it was found; landmark_ids and matches are theirs.
     """
 
     result: TrackingResult
@@ -101,6 +101,11 @@ class TrackingStage:
         return self._place.reference if self._place.begun else None
 
     @property
+    def turns(self) -> int:
+        """Quarter turns counter-clockwise by which the next image had better be turned before features are looked for in it."""
+        return self._place.turns if self._place is not None else 0
+
+    @property
     def map(self) -> Map | None:
         """The replica of the current map; read it and change nothing."""
         return self._place.map if self._place is not None else None
@@ -125,8 +130,8 @@ class TrackingStage:
         due = (self._placed_late(place, missed[row]) for row in rows)
         return [keyframe for keyframe in due if keyframe is not None]
 
-    def process(self, features: Features, matches: Matches | None, turned: Iterable[Features] = ()) -> TrackingOutput:
-        """Track one frame; `matches` are to `reference_features` (None: not matched yet). `turned` gives its features of other orientations, taken as needed."""
+    def process(self, features: Features, matches: Matches | None, turned: Turned | None = None) -> TrackingOutput:
+        """Track one frame; `matches` are to `reference_features` (None: not matched yet). `turned` is asked for its features of other orientations."""
         place = self._place
         if place is None:
             return self._start(features, matches)
@@ -139,6 +144,10 @@ class TrackingStage:
             found = doubt_of(place.map, found, place.reference_id, self._config) or found
         if isinstance(found, str):
             return self._recover(place, features, matches, found, turned)
+        if turned is not None and not place.lost_frames and not place.probation and (self.localization_only or self._keyframe_due(place, found)):
+            back = turn_back(place.map, place.reference_id, found, place.turns, turned, self._thorough or self._matcher, self._config)
+            if back is not None:
+                return self._go_on_turned(place, back)
         return self._accept(place, features, found, matches)
 
     def process_followed(self, features: Features, matches: Matches | None) -> TrackingOutput | Wanted:
@@ -195,7 +204,7 @@ class TrackingStage:
             self._place.search_frames = self._config.relocalization.search_frames
 
     def apply(self, update: MapUpdate) -> None:
-        """Bring the replica up to date; a new keyframe becomes the reference, and the motion model follows the reference's correction.
+        """Bring the replica up to date; a new keyframe becomes the reference unless images are turned otherwise by then, and the motion model follows the reference's correction.
 
         Updates of a map that was dropped in the meantime are ignored. Where the current map has become part of another, tracking goes on in that.
         """
@@ -213,7 +222,9 @@ class TrackingStage:
             before[newest] = place.map.keyframes[newest].world_from_camera.copy()
         place.take(update)
         if update.new_keyframes:
-            place.reference_id = place.last_keyframe_id = newest
+            place.last_keyframe_id = newest
+            if place.map.keyframes[newest].features.turns == place.turns:  # what comes after a turn does not look like what came before
+                place.reference_id = newest
             place.tracks.take(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
         if newest in before and newest in place.map.keyframes:
             corrected = Similarity(place.map.keyframes[newest].world_from_camera, update.scales.get(newest, 1.0))
@@ -295,6 +306,7 @@ class TrackingStage:
         for keyframe in initial.keyframes[-2:]:
             place.motion.update(keyframe.stamp_ns, keyframe.world_from_camera)
         place.awaited_since_ns = last.stamp_ns
+        place.turns = last.features.turns
         self._before, self._place = self._place, place
         self._next_map_id += 1
         self._next_keyframe_id += len(initial.keyframes)
@@ -325,7 +337,8 @@ class TrackingStage:
         keyframe = self._as_keyframe(place, features, found, matches)
         if keyframe is None:
             local = place.map.local_keyframes(place.reference_id, self._config.tracking.local_keyframes)
-            place.reference_id = best_reference(place.map, found.landmark_ids, local)
+            alike = [i for i in local if lie_alike(place.map.keyframes[i], found.world_from_camera, features.turns)]
+            place.reference_id = best_reference(place.map, found.landmark_ids, alike or local)
         result = self._result(place, features, found, keyframe.id if keyframe is not None else matched_to, keyframe is not None)
         return self._claim(place, features, TrackingOutput(result, keyframe, landmark_ids=found.landmark_ids, matches=matches))
 
@@ -374,6 +387,12 @@ class TrackingStage:
         place.pending[keyframe.id] = keyframe.world_from_camera
         return keyframe
 
+    def _go_on_turned(self, place: Place, found: FoundTurned) -> TrackingOutput:
+        """Accept a frame by the features of another orientation; the images to come are turned alike."""
+        place.reference_id, place.turns = found.reference_id, found.features.turns
+        logger.info("from %.3f s on images are turned by %d degrees", found.features.stamp_ns / 1e9, 90 * place.turns)
+        return replace(self._accept(place, found.features, found.localization, found.matches), found_turned=found.features)
+
     def _keyframe_due(self, place: Place, found: Localization) -> bool:
         if self.localization_only or len(place.pending) >= self._config.keyframe.most_pending:
             return False
@@ -382,7 +401,7 @@ class TrackingStage:
         depth = place.map.median_depth(place.reference_id, found.world_from_camera)
         return bool(needs_keyframe(place.last_keyframe_pose, found.world_from_camera, depth, tracked_ratio, self._config.keyframe))
 
-    def _recover(self, place: Place, features: Features, matches: Matches, reason: str, turned: Iterable[Features]) -> TrackingOutput:
+    def _recover(self, place: Place, features: Features, matches: Matches, reason: str, turned: Turned | None) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
         if place.probation:
             dropped = self._drop()
@@ -393,11 +412,13 @@ class TrackingStage:
         if found is not None:
             place.reference_id = found[1]
             return self._accept(place, features, found[0], found[2])
-        for other in turned if place.lost_frames < self._config.relocalization.new_map_after_frames else ():
+        rotations = self._config.loop.rotations if turned is not None and place.lost_frames < self._config.relocalization.new_map_after_frames else ()
+        for degrees in rotations:
+            assert turned is not None
+            other = turned((place.turns + degrees // 90) % 4)
             found = self._seek(place, other, self._matcher.match(other, place.reference))
             if found is not None:
-                place.reference_id = found[1]
-                return replace(self._accept(place, other, found[0], found[2]), found_turned=other)
+                return self._go_on_turned(place, FoundTurned(other, *found))
         if place.search_frames:
             place.search_frames -= 1
             self._unplaced.append(features)

@@ -19,9 +19,12 @@ from thegra_core.messages import FrameRecord, Run
 from thegra_core.slam import Slam
 from thegra_core.sources.joined import Clip, Joined, join
 
-Kind = Literal["pairs", "back", "between"]
+Kind = Literal["pairs", "back", "turned", "between"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-"""Two recordings, one after the other; one and its way back; one, another one, and the first one's way back."""
+"""Two recordings, one after the other; one and its way back; one, the camera turned half round at its end, and the way back upside down; one, another one, and the
+first one's way back."""
+Way = Literal["there", "turn", "back", "back turned"]
+"""How a recording is gone through; `turn` is the turn at its end, `back turned` the way back after it."""
 MAX_APART = 0.05
 """Of the extent of a clip's poses: how far apart the same image may lie, median, when its place is seen again."""
 MIN_SHARED_PCT = 50.0
@@ -33,10 +36,22 @@ class Part:
     """A recording's place in a joined one."""
 
     name: str
-    backwards: bool = False
+    way: Way = "there"
 
     def __str__(self) -> str:
-        return f"{self.name} back" if self.backwards else self.name
+        return self.name if self.way == "there" else f"{self.name} {self.way}"
+
+    @property
+    def shows_again(self) -> bool:
+        """Whether it is a way back."""
+        return self.way in ("back", "back turned")
+
+    def of(self, clip: Clip) -> Clip:
+        """The recording gone through that way."""
+        if self.way == "turn":
+            return clip.turning()
+        seen = clip.backwards() if self.shows_again else clip
+        return seen.upside_down() if self.way == "back turned" else seen
 
 
 Joining = tuple[Part, ...]
@@ -48,9 +63,11 @@ def planned(names: Sequence[str], kinds: Sequence[str]) -> list[Joining]:
     if "pairs" in kinds:
         plans += [(Part(a), Part(b)) for a, b in combinations(names, 2)]
     if "back" in kinds:
-        plans += [(Part(a), Part(a, backwards=True)) for a in names]
+        plans += [(Part(a), Part(a, "back")) for a in names]
+    if "turned" in kinds:
+        plans += [(Part(a), Part(a, "turn"), Part(a, "back turned")) for a in names]
     if "between" in kinds and len(names) > 1:
-        plans += [(Part(a), Part(b), Part(a, backwards=True)) for a, b in zip(names, [*names[1:], names[0]], strict=True)]
+        plans += [(Part(a), Part(b), Part(a, "back")) for a, b in zip(names, [*names[1:], names[0]], strict=True)]
     return plans
 
 
@@ -61,7 +78,7 @@ def title(plan: Joining) -> str:
 
 def run_one(clips: Mapping[str, Clip], plan: Joining, gap_s: float, settings: Settings) -> dict[str, Any]:
     """Figures and verdict of one joined recording."""
-    joined = join([clips[part.name].backwards() if part.backwards else clips[part.name] for part in plan], gap_s)
+    joined = join([part.of(clips[part.name]) for part in plan], gap_s)
     return judge(run(joined, settings), plan, joined)
 
 
@@ -97,7 +114,7 @@ def judge(finished: Run, plan: Joining, joined: Joined) -> dict[str, Any]:
 
 
 def _seen_again(placed: Sequence[FrameRecord], plan: Joining, joined: Joined) -> tuple[float | None, float | None]:
-    pairs = [(i, k) for k, later in enumerate(plan) for i, first in enumerate(plan[:k]) if first.name == later.name]
+    pairs = [(i, k) for k, later in enumerate(plan) for i, first in enumerate(plan[:k]) if first == Part(later.name) and later.shows_again]
     if not pairs:
         return None, None
     sights = {(int(joined.part[f.index]), int(joined.source[f.index])): f for f in placed}
