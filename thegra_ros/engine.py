@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import multiprocessing
 import time
@@ -14,7 +15,7 @@ from thegra_core.config import ThegraConfig
 from thegra_core.errors import InputError, MappingError, ThegraError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame, MapSummary, Snapshot, TrackingResult
-from thegra_core.process import set_threads
+from thegra_core.process import give_back_memory, set_threads
 from thegra_ros.beside import Beside, EngineError
 from thegra_ros.image_slot import make_slot, put, take
 
@@ -167,6 +168,8 @@ class LocalEngine:
     def _slam_for(self, job: Job) -> Slam:
         if self._slam is None or job.epoch != self._epoch:
             self._slam = None
+            gc.collect()
+            give_back_memory()
             self._slam = self._new(job.camera, job.home, self._emptied_mapping(job.camera) if self._beside else None)
             self._epoch = job.epoch
         self._slam.localization_only = job.localization_only

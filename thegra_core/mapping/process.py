@@ -6,6 +6,7 @@ solves. The process ends when the connection does, and at once with the process 
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import queue
@@ -31,7 +32,7 @@ from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.service import InlineMapping
 from thegra_core.messages import InitialMap, Keyframe, MapUpdate
 from thegra_core.optimization.solver import ProcessSolver
-from thegra_core.process import Usage, keep_freed_memory, own_usage
+from thegra_core.process import Usage, give_back_memory, keep_freed_memory, own_usage
 
 logger = logging.getLogger(__name__)
 LAST_WORDS_S = 5.0
@@ -249,6 +250,8 @@ def serve(connection: Connection) -> None:
                         mapping.drop(known.map_id)
                 (camera,) = arguments
                 mapping = InlineMapping(Mapper(camera, config, matcher, ProcessSolver()))
+                gc.collect()
+                give_back_memory()
                 continue
             assert mapping is not None
             for answer in _do(mapping, name, arguments, inbox.work_waits):
