@@ -19,9 +19,9 @@ from ros_graph import OFFLINE, Graph, NodeProcess, children
 from sensor_msgs.msg import PointCloud2
 
 from thegra_core.config import load_config
+from thegra_core.evaluation.benchmark.memory import descendants
 from thegra_core.messages import InitialMap, Keyframe
 from thegra_core.slam import Slam
-from thegra_ros.benchmark.processes import descendants
 from thegra_ros.codec.records import Assembler, initial_map_tables, keyframe_tables, record_clouds, word
 from thegra_ros.codec.stamps import header
 from thegra_ros.qos import LOSSLESS
