@@ -20,6 +20,12 @@ _KEPT_BYTES = 512 << 20
 _LARGEST_BYTES = 256 << 20
 
 
+def most_threads() -> int:
+    """One a core that this process may use, `MOST_THREADS` at most."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, MOST_THREADS)
+
+
 def set_threads(count: int) -> None:
     """Tell OpenMP, which reads it when torch is imported (a cache may make that unnecessary), how many threads to use, and to wait briefly, then sleep.
 
@@ -30,8 +36,7 @@ def set_threads(count: int) -> None:
         count: 0: one a core, `MOST_THREADS` at most. `OMP_NUM_THREADS` wins over it. A count given is OpenCV's and numpy's, too, which else take all cores: a
             product of small matrices then waits for a thread on a core that mapping has.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    os.environ.setdefault("OMP_NUM_THREADS", str(count or min(cores, MOST_THREADS)))
+    os.environ.setdefault("OMP_NUM_THREADS", str(count or most_threads()))
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
     if count:

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from thegra_core.config import ThegraConfig
 from thegra_core.errors import MappingError
 from thegra_core.features.front_end import DetectAndFollow, DetectEach
-from thegra_core.features.nearest import Nearest
 from thegra_core.features.protocols import Extractor, FrontEnd, Matcher, Wanted
-from thegra_core.features.registry import make_extractor, make_frame_matcher, make_matcher
-from thegra_core.features.tracks import TrackMatcher, shared_tracks
-from thegra_core.features.turning import TurnableExtractor, TurningMatcher
+from thegra_core.features.registry import make_extractor, make_frame_matcher, make_matcher, make_tracking_matchers
+from thegra_core.features.tracks import shared_tracks
+from thegra_core.features.turning import TurnableExtractor
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.map.map import Map, summarize
 from thegra_core.mapping.mapper import Mapper
@@ -113,9 +112,7 @@ class Slam:
         self._masks = config.tracking.mask_fixed_pattern
         self._extractor = TurnableExtractor(extractor if extractor is not None else make_extractor(config.extractor))
         configured = matcher if matcher is not None else make_matcher(config.matcher, config.extractor)
-        quick = Nearest(config.matcher) if config.tracking.match_by == "nearest" else None
-        self._matcher = make_frame_matcher(config, quick or configured)
-        self._thorough = TrackMatcher(TurningMatcher(configured), None) if quick is not None else None
+        self._matcher, self._thorough = make_tracking_matchers(config, configured)
         self._front_end: FrontEnd = DetectEach(self._extractor)
         if config.flow.enabled:
             self._front_end = DetectAndFollow(self._extractor, config.flow)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from thegra_core.config import ExtractorConfig, MatcherConfig, ThegraConfig
 from thegra_core.errors import ConfigError
 from thegra_core.features.protocols import Extractor, Matcher
+from thegra_core.process import most_threads
 
 EXTRACTOR_WEIGHTS: dict[str, tuple[str, ...]] = {
     "superpoint": ("superpoint_v1",),
@@ -78,6 +79,19 @@ def make_frame_matcher(config: ThegraConfig, matcher: Matcher | None = None) -> 
 
     learned = TurningMatcher(matcher if matcher is not None else make_matcher(config.matcher, config.extractor))
     return TrackMatcher(learned, config.flow.min_shared) if config.flow.enabled else learned
+
+
+def make_tracking_matchers(config: ThegraConfig, matcher: Matcher) -> tuple[Matcher, Matcher | None]:
+    """For tracking: what pairs each frame with its reference, and the thorough one that is asked where that finds too little, if there are to be two."""
+    from thegra_core.features.hurry import Hurried
+    from thegra_core.features.nearest import Nearest
+    from thegra_core.features.tracks import TrackMatcher
+    from thegra_core.features.turning import TurningMatcher
+
+    if config.tracking.match_by != "nearest":
+        return make_frame_matcher(config, matcher), None
+    hurried = Hurried(matcher, most_threads()) if config.threads else matcher
+    return make_frame_matcher(config, Nearest(config.matcher)), TrackMatcher(TurningMatcher(hurried), None)
 
 
 def matcher_name(config: MatcherConfig, extractor: ExtractorConfig) -> str:

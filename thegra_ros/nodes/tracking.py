@@ -21,11 +21,8 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from thegra_core.errors import InputError
-from thegra_core.features.nearest import Nearest
 from thegra_core.features.protocols import Wanted
-from thegra_core.features.registry import make_frame_matcher, make_matcher
-from thegra_core.features.tracks import TrackMatcher
-from thegra_core.features.turning import TurningMatcher
+from thegra_core.features.registry import make_matcher, make_tracking_matchers
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Matches, Shutter, TrackingResult, TrackingState
 from thegra_core.tracking.stage import TrackingOutput, TrackingStage
@@ -41,7 +38,7 @@ from thegra_ros.joiner import FrameJoiner
 from thegra_ros.lifecycle import run_node
 from thegra_ros.outputs import PoseOutputs
 from thegra_ros.qos import LATCHED, LOSSLESS
-from thegra_ros.stage_node import EVERYTHING, StageNode
+from thegra_ros.stage_node import StageNode
 from thegra_ros.transforms import stamped_pose
 
 PATIENCE_S = 5.0
@@ -86,10 +83,7 @@ class TrackingNode(StageNode):
         self.listen(PointCloud2, "map_update", LOSSLESS, self._on_update)
 
     def load(self) -> None:
-        learned = make_matcher(self.config.matcher, self.config.extractor)
-        quick = Nearest(self.config.matcher) if self.config.tracking.match_by == "nearest" else None
-        self._matcher = make_frame_matcher(self.config, quick or learned)
-        self._thorough = TrackMatcher(TurningMatcher(learned), EVERYTHING) if quick is not None else None
+        self._matcher, self._thorough = make_tracking_matchers(self.config, make_matcher(self.config.matcher, self.config.extractor))
 
     def work(self, item: Mapping[str, Any]) -> None:
         self._unanswered = "followed" in item
