@@ -441,9 +441,10 @@ class TrackingStage:
     def _seek_thoroughly(
         self, place: Place, features: Features, candidates: list[int], matcher: Matcher, nearby: bool
     ) -> tuple[Localization, int, Matches] | None:
-        """Match a frame to the first candidate, and to the others only if that one is not enough: a slow matcher costs frames of a live camera."""
+        """Match a frame to the candidates; where the camera was just now to the first, and to the others only if that one is not enough: a slow matcher costs frames
+        of a live camera. What may be anywhere is worth the matches to all."""
         first = {candidates[0]: matcher.match(features, place.map.keyframes[candidates[0]].features)}
-        for others in ([], candidates[1:]):
+        for others in ([], candidates[1:]) if nearby else (candidates[1:],):
             found = relocalize(place.map, features, others, matcher, self._config, nearby, first)
             if found is not None:
                 return found
