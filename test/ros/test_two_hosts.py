@@ -28,8 +28,9 @@ def can_make_hosts() -> str:
     """Why there can be no two hosts here, or nothing."""
     if not hasattr(os, "geteuid") or os.geteuid() != 0:
         return "network namespaces need root"
-    if shutil.which("ip") is None:
-        return "iproute2 is not installed"
+    for tool, package in (("ip", "iproute2"), ("nsenter", "util-linux")):
+        if shutil.which(tool) is None:
+            return f"{package} is not installed"
     probe = subprocess.run(["ip", "netns", "add", f"thegra_probe_{os.getpid()}"], capture_output=True, text=True, check=False)
     subprocess.run(["ip", "netns", "delete", f"thegra_probe_{os.getpid()}"], capture_output=True, check=False)
     return f"no network namespaces here: {probe.stderr.strip()}" if probe.returncode else ""
@@ -50,6 +51,11 @@ class Hosts:
             self._ip(host, "address", "add", f"10.77.0.{number}/24", "dev", self._links[host])
             for link in ("lo", self._links[host]):
                 self._ip(host, "link", "set", link, "up")
+        # two hosts share no memory: each has its own, in which only its own processes meet
+        own_memory = "mount -t tmpfs tmpfs /dev/shm && echo && exec sleep infinity"
+        self._hosts = {host: subprocess.Popen(["ip", "netns", "exec", name, "sh", "-c", own_memory], stdout=subprocess.PIPE) for host, name in self.names.items()}
+        for process in self._hosts.values():
+            assert process.stdout is not None and process.stdout.readline() == b"\n"
 
     def run(self, host: str, name: str, *command: str) -> None:
         environment = {
@@ -58,7 +64,7 @@ class Hosts:
         }  # fmt: skip
         with (self._folder / f"{name}.log").open("w") as log:
             self.processes[name] = subprocess.Popen(
-                ["ip", "netns", "exec", self.names[host], sys.executable, *command], env=environment, stdout=log, stderr=subprocess.STDOUT
+                ["nsenter", "-t", str(self._hosts[host].pid), "-m", "-n", sys.executable, *command], env=environment, stdout=log, stderr=subprocess.STDOUT
             )
 
     def node(self, host: str, name: str, *extra: str) -> None:
@@ -84,9 +90,9 @@ class Hosts:
         return int(json.loads(told)[0]["stats64"]["tx"]["bytes"])
 
     def close(self) -> None:
-        for process in self.processes.values():
+        for process in (*self.processes.values(), *self._hosts.values()):
             process.kill()
-            process.wait()
+            process.communicate()
         for name in self.names.values():
             subprocess.run(["ip", "netns", "delete", name], capture_output=True, check=False)
 
