@@ -349,7 +349,7 @@ class ThegraConfig(Section):
 
     profile: str = Field("quality", description="the profile the values started from")
     seed: int = Field(0, ge=0, description="of every random choice")
-    threads: int = Field(0, ge=0, description="CPU threads of the networks, unless OMP_NUM_THREADS says otherwise; 0: one a core, 4 at most")
+    threads: int = Field(0, ge=0, description="CPU threads of the networks, unless OMP_NUM_THREADS says otherwise; 0: one a core, 4 at most, as a lost camera is sought with in any case")
     weighting: Literal["normalized", "paper", "uniform"] = Field("normalized", description="observation weights from detection scores: over the keyframe's median; the literal score squared (paper Eq. 1); none")
     preprocessing: PreprocessingConfig = PreprocessingConfig()
     extractor: ExtractorConfig = ExtractorConfig()

@@ -259,16 +259,15 @@ class Slam:
     def _see(self, frame: Frame) -> TrackingOutput:
         with self._timed("preprocessing"):
             image = self._chain(frame.image, frame.stamp_ns)
+        if self._extractor.turns != self._tracking.turns:  # nothing that was found in images turned otherwise is followed on
+            self._extractor.turns = self._tracking.turns
+            self._front_end.forget()
         with self._timed("flow"):
             followed = self._front_end.follow(image, frame.stamp_ns)
         with self._timed("mapping"):
             self._take_updates()  # of keyframes that came before: this frame needs their landmarks
             for keyframe in self._tracking.catch_up():
                 self._mapping.insert(keyframe)
-        if self._extractor.turns != self._tracking.turns:  # nothing that was found in images turned otherwise is followed on
-            self._extractor.turns = self._tracking.turns
-            self._front_end.forget()
-            followed = self._front_end.follow(image, frame.stamp_ns)
         reference = self._tracking.reference_features
         features, output = self._front(image, frame.stamp_ns, followed, reference)
         if output.dropped_map_id is not None:

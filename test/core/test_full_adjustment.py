@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from synthetic import CAMERA, FakeMatcher, look, loop, observe, room, stamp
 from test_bundle import CHI2, HUBER, problem
-from test_tracking_stage import CONFIG, Pair
+from tracking_pair import CONFIG, Pair
 
 from thegra_core.geometry import poses
 from thegra_core.map.editor import MapEditor

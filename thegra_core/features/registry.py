@@ -84,14 +84,25 @@ def make_frame_matcher(config: ThegraConfig, matcher: Matcher | None = None) -> 
 def make_tracking_matchers(config: ThegraConfig, matcher: Matcher) -> tuple[Matcher, Matcher | None]:
     """For tracking: what pairs each frame with its reference, and the thorough one that is asked where that finds too little, if there are to be two."""
     from thegra_core.features.hurry import Hurried
-    from thegra_core.features.nearest import Nearest
     from thegra_core.features.tracks import TrackMatcher
     from thegra_core.features.turning import TurningMatcher
 
+    first = make_first_matcher(config, matcher)
     if config.tracking.match_by != "nearest":
-        return make_frame_matcher(config, matcher), None
+        return first, None
     hurried = Hurried(matcher, most_threads()) if config.threads else matcher
-    return make_frame_matcher(config, Nearest(config.matcher)), TrackMatcher(TurningMatcher(hurried), None)
+    return first, TrackMatcher(TurningMatcher(hurried), None)
+
+
+def make_first_matcher(config: ThegraConfig, matcher: Matcher | None = None) -> Matcher:
+    """What pairs each frame with its reference: nearest descriptors where `tracking.match_by` says so, which loads no network, else as `make_frame_matcher`.
+
+    Raises:
+        ConfigError, WeightsError: As `make_matcher`.
+    """
+    from thegra_core.features.nearest import Nearest
+
+    return make_frame_matcher(config, Nearest(config.matcher) if config.tracking.match_by == "nearest" else matcher)
 
 
 def matcher_name(config: MatcherConfig, extractor: ExtractorConfig) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.config import ThegraConfig
+from thegra_core.features.tracks import followed_rows
 from thegra_core.geometry import poses
 from thegra_core.map.map import Map
 from thegra_core.messages import NO_LANDMARK, Features
@@ -48,8 +49,8 @@ class TrackLandmarks:
         if features.track_ids is None:
             self._ids = self._landmarks = np.empty(0, np.int64)
             return
-        order = np.argsort(features.track_ids)
-        order = order[np.searchsorted(features.track_ids[order], 0) :]  # those that are followed
+        rows = followed_rows(features)
+        order = rows[np.argsort(features.track_ids[rows])]
         self._ids, self._landmarks = features.track_ids[order], landmark_ids[order]
 
     def take(self, features: Features, landmark_ids: IntArray) -> None:
@@ -57,7 +58,7 @@ class TrackLandmarks:
         if len(self._ids) == 0:
             self.replace(features, landmark_ids)
         elif features.track_ids is not None:
-            rows = np.flatnonzero(features.track_ids >= 0)
+            rows = followed_rows(features)
             _, here, there = np.intersect1d(self._ids, features.track_ids[rows], assume_unique=True, return_indices=True)
             self._landmarks[here] = landmark_ids[rows[there]]
 

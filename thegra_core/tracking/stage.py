@@ -144,7 +144,7 @@ class TrackingStage:
             found = doubt_of(place.map, found, place.reference_id, self._config) or found
         if isinstance(found, str):
             return self._recover(place, features, matches, found, turned)
-        if turned is not None and not place.lost_frames and not place.probation and (self.localization_only or self._keyframe_due(place, found)):
+        if self._may_turn_back(place, found) and turned is not None:
             back = turn_back(place.map, place.reference_id, found, place.turns, turned, self._thorough or self._matcher, self._config)
             if back is not None:
                 return self._go_on_turned(place, back)
@@ -386,6 +386,12 @@ class TrackingStage:
         self._next_keyframe_id += 1
         place.pending[keyframe.id] = keyframe.world_from_camera
         return keyframe
+
+    def _may_turn_back(self, place: Place, found: Localization) -> bool:
+        """Whether a tracked frame is one to be looked for turned: not every one, for that costs an extraction."""
+        if not self._config.loop.rotations or place.lost_frames or place.probation:
+            return False
+        return self.localization_only or self._keyframe_due(place, found)
 
     def _go_on_turned(self, place: Place, found: FoundTurned) -> TrackingOutput:
         """Accept a frame by the features of another orientation; the images to come are turned alike."""

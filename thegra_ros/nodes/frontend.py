@@ -18,9 +18,8 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header
 
 from thegra_core.features.front_end import DetectAndFollow, DetectEach
-from thegra_core.features.nearest import Nearest
 from thegra_core.features.protocols import FrontEnd, Wanted
-from thegra_core.features.registry import make_extractor, make_frame_matcher
+from thegra_core.features.registry import make_extractor, make_first_matcher
 from thegra_core.features.tracks import shared_tracks
 from thegra_core.messages import Features, Frame, Matches, Shutter
 from thegra_core.tracking.fixed_pattern import FixedPatternMask
@@ -61,8 +60,7 @@ class FrontendNode(StageNode):
 
     def load(self) -> None:
         extractor = make_extractor(self.config.extractor)
-        nearest = Nearest(self.config.matcher) if self.config.tracking.match_by == "nearest" else None
-        self._matcher = make_frame_matcher(self.config, nearest)
+        self._matcher = make_first_matcher(self.config)
         self._front: FrontEnd = DetectAndFollow(extractor, self.config.flow) if self.config.flow.enabled else DetectEach(extractor)
 
     def work(self, item: Mapping[str, Any]) -> None:
