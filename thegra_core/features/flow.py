@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,12 +35,22 @@ class Followed:
 
 def normalize_contrast(image: Image) -> Image:
     """(H, W) uint8 without local brightness and contrast: gain control that changes both from frame to frame would be motion to Lucas-Kanade."""
-    values = image.astype(np.float32)
     size = (CONTRAST_WINDOW, CONTRAST_WINDOW)
-    mean = cv2.boxFilter(values, -1, size)
-    variance = cv2.boxFilter(values * values, -1, size) - mean * mean
-    scaled = 128 + CONTRAST_LEVELS * (values - mean) / np.sqrt(np.maximum(variance, LEAST_VARIANCE))
-    return np.asarray(np.clip(scaled, 0, 255), np.uint8)
+    image = np.ascontiguousarray(image)
+    normalized: Image = np.empty_like(image)
+    mean, mean_square = (np.asarray(box(image, cv2.CV_32F, size), np.float32) for box in (cv2.boxFilter, cv2.sqrBoxFilter))
+    _normalize(image, mean, mean_square, normalized)
+    return normalized
+
+
+@numba.njit("void(u1[:, ::1], f4[:, ::1], f4[:, ::1], u1[:, ::1])", cache=True, fastmath=True, error_model="numpy")  # compiled before a camera runs
+def _normalize(image: Image, mean: NDArray[np.float32], mean_square: NDArray[np.float32], normalized: Image) -> None:
+    middle, levels, least, most = np.float32(128), np.float32(CONTRAST_LEVELS), np.float32(LEAST_VARIANCE), np.float32(255)
+    for row in range(image.shape[0]):
+        for column in range(image.shape[1]):
+            m = mean[row, column]
+            deviation = np.sqrt(max(mean_square[row, column] - m * m, least))
+            normalized[row, column] = np.uint8(min(max(middle + levels * (np.float32(image[row, column]) - m) / deviation, np.float32(0)), most))
 
 
 def follow(before: Image, after: Image, points: Points, start: Points, config: FlowConfig) -> Followed:
@@ -47,19 +58,38 @@ def follow(before: Image, after: Image, points: Points, start: Points, config: F
 
     A point counts as found if it lies inside, leads back to where it came from, and looks like it did.
     """
+    there, inside = step(before, after, points, start, config)
+    return confirmed(before, after, points, there, inside, config)
+
+
+def step(before: Image, after: Image, points: Points, start: Points, config: FlowConfig) -> tuple[Points, BoolArray]:
+    """The first part of `follow`: where points (N, 2) px may be, and which (N,) lie inside."""
     if len(points) == 0:
-        return Followed(np.empty((0, 2), np.float32), np.empty(0, bool), np.empty(0, np.float32))
-    window, use_start = (config.window, config.window), cv2.OPTFLOW_USE_INITIAL_FLOW
-    moved, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, np.array(start, np.float32, order="C"), winSize=window, maxLevel=config.levels, criteria=_STEPS, flags=use_start)
+        return np.empty((0, 2), np.float32), np.empty(0, bool)
+    window = (config.window, config.window)
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, points, np.array(start, np.float32, order="C"), winSize=window, maxLevel=config.levels, criteria=_STEPS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
     there: Points = np.asarray(moved, np.float32)
-    back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, points.copy(), winSize=window, maxLevel=1, criteria=_STEPS, flags=use_start)
-    found = (status.ravel() > 0) & (status_back.ravel() > 0)
-    found &= np.linalg.norm(back - points, axis=1) < config.max_back_px
     height, width = after.shape
-    found &= (there >= config.border).all(axis=1) & (there[:, 0] <= width - 1 - config.border) & (there[:, 1] <= height - 1 - config.border)
-    similarity = np.full(len(points), -1, np.float32)
-    similarity[found] = patch_similarity(before, after, points[found], there[found], config.patch)
-    return Followed(there, found & (similarity >= config.min_similarity), similarity)
+    inside = (there >= config.border).all(axis=1) & (there[:, 0] <= width - 1 - config.border) & (there[:, 1] <= height - 1 - config.border)
+    return there, (status.ravel() > 0) & inside
+
+
+def confirmed(before: Image, after: Image, points: Points, there: Points, asked: BoolArray, config: FlowConfig) -> Followed:
+    """The second part of `follow`, for the points that are `asked` (N,) for: the others are not found."""
+    result = Followed(there, np.zeros(len(points), bool), np.full(len(points), -1, np.float32))
+    rows = np.flatnonzero(asked)
+    if len(rows) == 0:
+        return result
+    window, origin = (config.window, config.window), np.ascontiguousarray(points[rows], np.float32)
+    back, status, _ = cv2.calcOpticalFlowPyrLK(
+        after, before, there[rows], origin.copy(), winSize=window, maxLevel=1, criteria=_STEPS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
+    rows = rows[(status.ravel() > 0) & (np.linalg.norm(back - origin, axis=1) < config.max_back_px)]
+    result.similarity[rows] = patch_similarity(before, after, points[rows], there[rows], config.patch)
+    result.found[rows] = result.similarity[rows] >= config.min_similarity
+    return result
 
 
 def patch_similarity(before: Image, after: Image, points: Points, there: Points, size: int) -> NDArray[np.float32]:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from thegra_core.config import FlowConfig
+from thegra_core.features.anchors import Anchors, anchor, joined, lay, worn
 from thegra_core.features.detection import spread
-from thegra_core.features.flow import follow, normalize_contrast
+from thegra_core.features.flow import Followed, Points, confirmed, normalize_contrast, step
 from thegra_core.features.protocols import Extractor, Wanted
 from thegra_core.features.registration import coarse_shift, follow_far
 from thegra_core.features.tracks import only_followed
@@ -20,6 +21,8 @@ from thegra_core.messages import UNFOLLOWED, Features
 Image = NDArray[np.uint8]
 CROWDING = 1.0
 """Of the points that are followed: each part of the image has its even share of them, see `spread`."""
+MOST_WORN = 0.5
+"""Share of the points that may look like something else before the image is taken to."""
 NEW = -2
 """Number of a keypoint that may be followed from now on."""
 
@@ -47,11 +50,13 @@ class DetectEach:
 
 @dataclass(frozen=True, slots=True)
 class _Trail:
-    """The last image as it was seen and normalized, and the points that are followed in it; `detected` counts those after the last detection."""
+    """The last image as it was seen and normalized, and the points that are followed in it, with what they looked like; `detected` counts those after the last
+    detection."""
 
     image: Image
     normalized: Image
     features: Features
+    anchors: Anchors
     detected: int
 
 
@@ -59,8 +64,8 @@ class DetectAndFollow:
     """`FrontEnd` that detects when it must or is told to, and follows these keypoints through the images between.
 
     A keypoint keeps number, descriptor and the score of its detection, which falls with how its surroundings change. Detecting again keeps what is
-    followed where it is, with a descriptor of what is detected there, and adds what is detected elsewhere. Beyond `max_points` keypoints are not followed: they
-    are there to be matched.
+    followed where it is, with a descriptor of what is detected there, and adds what is detected elsewhere; what does not look any more like what it was is
+    followed no longer. Beyond `max_points` keypoints are not followed: they are there to be matched.
     """
 
     def __init__(self, extractor: Extractor, config: FlowConfig) -> None:
@@ -73,16 +78,17 @@ class DetectAndFollow:
         """See `FrontEnd.follow`."""
         normalized, before = normalize_contrast(image), self._trail
         if before is None or before.normalized.shape != image.shape:
-            self._trail = _Trail(image, normalized, _none(stamp_ns, image), 0)
+            nothing = _none(stamp_ns, image)
+            self._trail = _Trail(image, normalized, nothing, self._anchored(normalized, nothing), 0)
             return None
-        followed = self._followed(before, normalized, stamp_ns)
-        self._trail = _Trail(image, normalized, followed, before.detected)
+        followed, anchors = self._followed(before, normalized, stamp_ns)
+        self._trail = _Trail(image, normalized, followed, anchors, before.detected)
         return followed if len(followed) >= max(self._config.min_points, self._config.min_share * before.detected) else None
 
     def detect(self, wanted: Wanted = Wanted.MORE) -> Features:
         """See `FrontEnd.detect`."""
         assert self._trail is not None
-        trail = self._trail
+        trail = self._without_worn(self._trail)
         found = self._extractor.extract(trail.image, trail.features.stamp_ns)
         candidates = spread(found.keypoints, found.scores, self._config.max_points, found.image_size, CROWDING)
         ids = np.full(len(found), UNFOLLOWED, np.int64)
@@ -92,23 +98,51 @@ class DetectAndFollow:
             features = merged(trail.features, features, self._config.near_px)
         features = self._numbered(features)
         followed = only_followed(features)
-        self._trail = _Trail(trail.image, trail.normalized, followed, len(followed))
+        kept = replace(trail.anchors, scores=followed.scores[: len(trail.anchors)]) if wanted is Wanted.MORE else trail.anchors.chosen(np.empty(0, np.int64))
+        new = self._anchored(trail.normalized, followed.chosen(np.arange(len(kept), len(followed))))
+        self._trail = _Trail(trail.image, trail.normalized, followed, joined(kept, new), len(followed))
         return features
 
     def forget(self) -> None:
         """See `FrontEnd.forget`."""
         self._trail = None
 
-    def _followed(self, before: _Trail, normalized: Image, stamp_ns: int) -> Features:
-        points, there = before.features.keypoints, (before.normalized, normalized)
-        result = follow(*there, points, points + coarse_shift(*there), self._config)
+    def _followed(self, before: _Trail, normalized: Image, stamp_ns: int) -> tuple[Features, Anchors]:
+        """The points found: each where its square lies, if that can be said, else where the step from the last image has led."""
+        points, images = before.features.keypoints, (before.normalized, normalized)
+        there, inside = step(*images, points, points + coarse_shift(*images), self._config)
+        result, exact, anchors = self._checked(before, normalized, there, inside)
         if len(points) and result.found.mean() < self._config.far_share:
-            result = follow_far(*there, points, result, self._config)
+            far = follow_far(*images, points, result, self._config)
+            result, exact, anchors = self._checked(before, normalized, far.points, far.found, far)
         chosen = np.flatnonzero(result.found)
         old = before.features
         assert old.track_ids is not None
-        scores = old.scores[chosen] * result.similarity[chosen]
-        return Features(stamp_ns, result.points[chosen], scores, old.descriptors[chosen], old.image_size, old.extractor, old.track_ids[chosen], old.turns)
+        scores = np.where(exact, anchors.scores, old.scores)[chosen] * result.similarity[chosen]
+        features = Features(stamp_ns, result.points[chosen], scores, old.descriptors[chosen], old.image_size, old.extractor, old.track_ids[chosen], old.turns)
+        return features, anchors.chosen(chosen)
+
+    def _checked(
+        self, before: _Trail, normalized: Image, there: Points, inside: NDArray[np.bool_], known: Followed | None = None
+    ) -> tuple[Followed, NDArray[np.bool_], Anchors]:
+        """Points whose square is found where the step has led are right; the others have to be confirmed, if they are not `known` to be."""
+        places, exact, anchors = lay(before.anchors, normalized, there, self._config)
+        exact &= inside
+        other = known if known is not None else confirmed(before.normalized, normalized, before.features.keypoints, there, inside & ~exact, self._config)
+        similarity = np.where(exact, anchors.similarity, other.similarity)
+        return Followed(np.where(exact[:, None], places, there), exact | other.found, similarity), exact, anchors
+
+    def _anchored(self, normalized: Image, features: Features) -> Anchors:
+        return anchor(normalized, features.keypoints, features.scores, self._config.patch)
+
+    def _without_worn(self, trail: _Trail) -> _Trail:
+        """Follow no longer what does not look any more like what was detected. Where that is most of it the image looks different, not the points: they
+        are taken as they look there."""
+        gone = worn(trail.anchors, self._config)
+        if gone.sum() <= MOST_WORN * len(gone):
+            rows = np.flatnonzero(~gone)
+            return replace(trail, features=trail.features.chosen(rows), anchors=trail.anchors.chosen(rows))
+        return replace(trail, anchors=self._anchored(trail.normalized, trail.features))
 
     def _numbered(self, features: Features) -> Features:
         """Give a number to each new keypoint, as long as there are not `max_points` with one."""
