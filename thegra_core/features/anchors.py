@@ -25,7 +25,7 @@ PARAMETERS = 6
 """Of an affine map: the matrix row by row, and the shift."""
 MOST_GROWN = 1.5
 """Factor in size, either way, beyond which a square shows too little or too much to be compared."""
-_ROUNDS, _CONVERGED_PX, _DAMPING, _FLAT = 8, 0.03, 1e-3, 1e-3
+_ROUNDS, _CONVERGED_PX, _DAMPING, _LEAST, _FLAT = 8, 0.03, 1e-3, 1e-12, 1e-3
 _compile = numba.njit(cache=True, fastmath=True, error_model="numpy")
 
 
@@ -55,8 +55,12 @@ class Anchors:
 def anchor(image: Image, points: Points, scores: FloatArray, size: int) -> Anchors:
     """Keep the squares of `size` px around points (N, 2) px of a contrast-normalized image."""
     squares = np.empty((len(points), size * size), np.float32)
-    steps = np.zeros((len(points), PARAMETERS, size * size), np.float32)
-    _prepare(image, np.ascontiguousarray(points, np.float32), size, squares, steps)
+    slopes = np.zeros((len(points), PARAMETERS, size * size), np.float32)
+    _prepare(image, np.ascontiguousarray(points, np.float32), size, squares, slopes)
+    normal = (slopes @ slopes.transpose(0, 2, 1)).astype(np.float64)
+    diagonal = np.arange(PARAMETERS)
+    normal[:, diagonal, diagonal] = normal[:, diagonal, diagonal] * (1.0 + _DAMPING) + _LEAST
+    steps = np.linalg.inv(normal).astype(np.float32) @ slopes
     return Anchors(squares, steps, np.tile(np.eye(2, dtype=np.float32), (len(points), 1, 1)), np.ones(len(points), np.float32), np.asarray(scores, np.float32))
 
 
@@ -100,7 +104,8 @@ def _between(image: Image, x: float, y: float) -> float:
 
 
 @numba.njit("void(u1[:, ::1], f4[:, ::1], i8, f4[:, ::1], f4[:, :, ::1])", cache=True, fastmath=True, error_model="numpy")
-def _prepare(image: Image, points: Points, size: int, squares: FloatArray, steps: FloatArray) -> None:
+def _prepare(image: Image, points: Points, size: int, squares: FloatArray, all_slopes: FloatArray) -> None:
+    """The squares, and how each pixel changes with each parameter; nothing changes where a square is flat."""
     half, pixels = (size - 1) / 2, size * size
     slopes, around = np.empty((PARAMETERS, pixels)), np.empty((size + 2, size + 2))
     for i in range(len(points)):
@@ -121,11 +126,7 @@ def _prepare(image: Image, points: Points, size: int, squares: FloatArray, steps
             slopes[2, k], slopes[3, k], slopes[5, k] = down * (u - half), down * (v - half), down
         for p in range(PARAMETERS):  # what brightness and contrast explain is not the map's
             slopes[p] = (slopes[p] - slopes[p].mean() - (slopes[p] * square).sum() * square) / norm
-        normal = slopes @ slopes.T
-        for p in range(PARAMETERS):
-            normal[p, p] = normal[p, p] * (1.0 + _DAMPING) + 1e-12
-        squares[i] = square.astype(np.float32)
-        steps[i] = np.linalg.solve(normal, slopes).astype(np.float32)
+        squares[i], all_slopes[i] = square.astype(np.float32), slopes.astype(np.float32)
 
 
 @_compile
