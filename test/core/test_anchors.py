@@ -92,6 +92,16 @@ def test_squares_at_the_border_and_none_at_all_are_no_trouble() -> None:
     assert len(lay(none, image, corners[:0], CONFIG)[0]) == 0 and len(joined(none, after)) == 3
 
 
+def test_images_that_may_not_be_written_to_are_as_good() -> None:
+    """Those of messages are."""
+    image, points = view(texture(), 0, 0)[0], grid()
+    image.flags.writeable = False
+    normalized = normalize_contrast(image)
+    normalized.flags.writeable = False
+    places, exact, _ = lay(anchor(normalized, points, ones(points), SIZE), normalized, points, CONFIG)
+    assert exact.all() and np.abs(places - points).max() < 0.01
+
+
 # ---- in the front end -------------------------------------------------------------------------------------------------------------
 
 

@@ -21,6 +21,7 @@ CONTRAST_LEVELS = 40.0
 """Grey levels of one standard deviation in the normalized image; 3.2 of them fit in 8 bit."""
 LEAST_VARIANCE = 25.0
 """Squared grey levels; below this an area is flat, and its noise is not blown up."""
+_IMAGE = numba.types.Array(numba.uint8, 2, "C", readonly=True)  # those of messages are
 _STEPS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 0.03)
 
 
@@ -43,7 +44,7 @@ def normalize_contrast(image: Image) -> Image:
     return normalized
 
 
-@numba.njit("void(u1[:, ::1], f4[:, ::1], f4[:, ::1], u1[:, ::1])", cache=True, fastmath=True, error_model="numpy")  # compiled before a camera runs
+@numba.njit(numba.void(_IMAGE, numba.float32[:, ::1], numba.float32[:, ::1], numba.uint8[:, ::1]), cache=True, fastmath=True, error_model="numpy")  # compiled before a camera runs
 def _normalize(image: Image, mean: NDArray[np.float32], mean_square: NDArray[np.float32], normalized: Image) -> None:
     middle, levels, least, most = np.float32(128), np.float32(CONTRAST_LEVELS), np.float32(LEAST_VARIANCE), np.float32(255)
     for row in range(image.shape[0]):
