@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_flow import CONFIG, HEIGHT, WIDTH, front_end, grid, moved, texture, view
 
-from thegra_core.features.anchors import anchor, joined, lay, worn
+from thegra_core.features.anchors import anchor, joined, lay, outgrown, renewed, worn
 from thegra_core.features.flow import follow, normalize_contrast
 from thegra_core.features.protocols import Wanted
 from thegra_core.features.tracks import shared_tracks
@@ -73,6 +73,21 @@ def test_what_looks_like_something_else_stays_where_the_step_has_led() -> None:
     assert exact.mean() < 0.02 and worn(after, CONFIG).mean() > 0.8
     np.testing.assert_array_equal(places[~exact], points[~exact])
     np.testing.assert_array_equal(after.warps[~exact], kept.warps[~exact])
+
+
+def test_what_has_come_nearer_is_taken_as_it_looks_there() -> None:
+    picture, points = texture(), grid(16, 100)
+    kept = anchor(normalize_contrast(view(picture, 0, 0)[0]), points, ones(points), SIZE)
+    at_first = view(picture, 0, 0)[1]
+    for zoom in (1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.7):
+        image, at = warped(picture, zoom * np.eye(2))
+        places, exact, kept = lay(kept, normalize_contrast(image), moved(points, at_first, at).astype(np.float32), CONFIG)
+    grown = outgrown(kept)
+    assert (exact & grown).sum() > 0.5 * len(points) and not worn(kept, CONFIG)[exact].any()
+    rows = np.flatnonzero(grown)
+    after = renewed(kept, rows, anchor(normalize_contrast(image), places[rows], ones(rows), SIZE))
+    assert not outgrown(after).any()
+    np.testing.assert_array_equal(after.squares[~grown], kept.squares[~grown])
 
 
 def test_a_flat_square_says_nothing_of_its_place() -> None:

@@ -24,7 +24,7 @@ IntArray = NDArray[np.int64]
 PARAMETERS = 6
 """Of an affine map: the matrix row by row, and the shift."""
 MOST_GROWN = 1.5
-"""Factor in size, either way, beyond which a square shows too little or too much to be compared."""
+"""Factor in size, either way, beyond which a square has too few pixels or too many to be compared well."""
 _ROUNDS, _CONVERGED_PX, _DAMPING, _LEAST, _FLAT = 8, 0.03, 1e-3, 1e-12, 1e-3
 _compile = numba.njit(cache=True, fastmath=True, error_model="numpy")
 _IMAGE = numba.types.Array(numba.uint8, 2, "C", readonly=True)  # those of messages are
@@ -89,8 +89,20 @@ def lay(anchors: Anchors, image: Image, points: Points, config: FlowConfig) -> t
 
 def worn(anchors: Anchors, config: FlowConfig) -> BoolArray:
     """(N,) which points do not look like their squares any more in the last image."""
+    return np.asarray(anchors.similarity < config.worn_similarity)
+
+
+def outgrown(anchors: Anchors) -> BoolArray:
+    """(N,) which squares lie over the last image much larger or smaller than they were."""
     grown = np.sqrt(np.abs(np.linalg.det(anchors.warps)))
-    return np.asarray((anchors.similarity < config.worn_similarity) | (grown > MOST_GROWN) | (grown < 1 / MOST_GROWN))
+    return np.asarray((grown > MOST_GROWN) | (grown < 1 / MOST_GROWN))
+
+
+def renewed(anchors: Anchors, rows: IntArray, fresh: Anchors) -> Anchors:
+    """The squares of `rows` (M,) replaced by others (M,); the scores stay."""
+    squares, steps, warps, similarity = anchors.squares.copy(), anchors.steps.copy(), anchors.warps.copy(), anchors.similarity.copy()
+    squares[rows], steps[rows], warps[rows], similarity[rows] = fresh.squares, fresh.steps, fresh.warps, fresh.similarity
+    return Anchors(squares, steps, warps, similarity, anchors.scores)
 
 
 @_compile

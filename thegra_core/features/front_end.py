@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from thegra_core.config import FlowConfig
-from thegra_core.features.anchors import Anchors, anchor, joined, lay, worn
+from thegra_core.features.anchors import Anchors, anchor, joined, lay, outgrown, renewed, worn
 from thegra_core.features.detection import spread
 from thegra_core.features.flow import Followed, Points, confirmed, normalize_contrast, step
 from thegra_core.features.protocols import Extractor, Wanted
@@ -136,13 +136,18 @@ class DetectAndFollow:
         return anchor(normalized, features.keypoints, features.scores, self._config.patch)
 
     def _without_worn(self, trail: _Trail) -> _Trail:
-        """Follow no longer what does not look any more like what was detected. Where that is most of it the image looks different, not the points: they
-        are taken as they look there."""
+        """Follow no longer what does not look any more like what was detected, and take what is just nearer or farther as it looks there.
+
+        Where most does not look alike the image looks different, not the points: all are taken as they look there.
+        """
         gone = worn(trail.anchors, self._config)
-        if gone.sum() <= MOST_WORN * len(gone):
+        if gone.sum() > MOST_WORN * len(gone):
+            again = np.arange(len(gone))
+        else:
             rows = np.flatnonzero(~gone)
-            return replace(trail, features=trail.features.chosen(rows), anchors=trail.anchors.chosen(rows))
-        return replace(trail, anchors=self._anchored(trail.normalized, trail.features))
+            trail = replace(trail, features=trail.features.chosen(rows), anchors=trail.anchors.chosen(rows))
+            again = np.flatnonzero(outgrown(trail.anchors))
+        return replace(trail, anchors=renewed(trail.anchors, again, self._anchored(trail.normalized, trail.features.chosen(again))))
 
     def _numbered(self, features: Features) -> Features:
         """Give a number to each new keypoint, as long as there are not `max_points` with one."""
