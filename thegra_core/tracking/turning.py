@@ -1,6 +1,7 @@
 """A camera that turns round while it is tracked: from when on its images are turned back, so that they go on lying as those of the map do.
 
-A turned image hardly shows the same keypoints as the upright one, so nothing can be carried over from the one to the other. But the camera has just seen what it sees, before it turned: keyframes that lie as the turned image does are near, and place it as they would any frame.
+A turned image hardly shows the same keypoints as the upright one, so nothing can be carried over from the one to the other. But the camera has just seen what it
+sees, before it turned: keyframes that lie as the turned image does are near, and place it as they would any frame.
 """
 
 from __future__ import annotations

@@ -16,11 +16,11 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
+from thegra_core.cli.run import make_live_system
 from thegra_core.config import ThegraConfig
 from thegra_core.errors import InputError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame, TrackingState
-from thegra_core.process import set_threads
 from thegra_ros.benchmark.processes import NAMESPACE, running
 from thegra_ros.codec.images import camera_info_message, image_message
 from thegra_ros.codec.stamps import header, stamp_ns
@@ -100,13 +100,8 @@ def _median(values: Sequence[float]) -> float:
 
 def direct(frames: Sequence[Frame], camera: CameraModel, config: ThegraConfig, rate_hz: float) -> dict[int, Alone]:
     """Each tracked frame by its stamp, with mapping in a process of its own, as in `thegra run --realtime`."""
-    set_threads(config.threads)
-    from thegra_core.features.registry import make_frame_matcher
-    from thegra_core.mapping.process import MappingProcess
-    from thegra_core.slam import Slam
-
     taken: dict[int, Alone] = {}
-    with closing(Slam(camera, config, keep_records=False, mapping=MappingProcess(camera, config, make_frame_matcher))) as slam:
+    with closing(make_live_system(camera, config)) as slam:
         slam.warm_up()
         for frame in paced(frames, rate_hz):
             begin = time.monotonic()
