@@ -6,7 +6,18 @@ import os
 import sys
 from pathlib import Path
 
+from thegra_core.lifeline import end_with_parent
+
 PROFILES_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+LIFELINE_VARIABLE = "THEGRA_LIFELINE"
+"""Names the file descriptor of the lifeline to what started the node, where that wants the node to end with it."""
+
+
+def end_with_supervisor() -> None:
+    """Have this process end with the one that started it, if that asks for it; processes that this one starts are not asked."""
+    line = os.environ.pop(LIFELINE_VARIABLE, None)
+    if line is not None:
+        end_with_parent(int(line))
 
 
 def use_large_segments() -> Path | None:

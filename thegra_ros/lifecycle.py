@@ -19,6 +19,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 
 from thegra_core.errors import ThegraError
 from thegra_ros.answers import answering
+from thegra_ros.environment import end_with_supervisor
 from thegra_ros.qos import publisher_options, subscription_options
 
 WATCH = "end in time"
@@ -174,6 +175,7 @@ def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = 
     Where it has not ended `LAST_WORDS_S` after its context was shut down it is ended with that code: neither a transport that waits for a partner that was
     killed nor a thread that still computes keeps a node alive.
     """
+    end_with_supervisor()
     try:
         rclpy.init(args=arguments)
     except Exception as error:  # RCLError is no public class

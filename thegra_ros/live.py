@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -10,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from thegra_core.errors import ConfigError
+from thegra_core.lifeline import Lifeline
 from thegra_core.process import keep_freed_memory
-from thegra_ros.environment import use_large_segments
+from thegra_ros.environment import LIFELINE_VARIABLE, use_large_segments
 
 STAGES = ("preprocessing", "frontend", "tracking", "mapping")
 POLL_S = 0.1
@@ -50,10 +52,19 @@ def live(options: LiveOptions) -> int:
 
 
 def supervise(commands: list[list[str]]) -> int:
-    """Run processes until told to end, or until one of them ends, which ends the others; 0, or the code of the one that ended first."""
+    """Run nodes until told to end, or until one of them ends, which ends the others; 0, or the code of the one that ended first.
+
+    Where this process is killed its nodes end as well.
+    """
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _interrupt)
-    processes = [subprocess.Popen(command) for command in commands]
+    lines = [Lifeline() for _ in commands]  # one each: whom the end is told is a property of the pipe
+    processes = [
+        subprocess.Popen(command, env={**os.environ, LIFELINE_VARIABLE: str(line.fd)}, pass_fds=[line.fd])
+        for command, line in zip(commands, lines, strict=True)
+    ]
+    for line in lines:
+        line.handed_over()
     try:
         while all(process.poll() is None for process in processes):
             time.sleep(POLL_S)

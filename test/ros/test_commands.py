@@ -66,3 +66,19 @@ forever = [sys.executable, "-c", "import signal; signal.pause()"]
 sys.exit(supervise([forever, [sys.executable, "-c", "raise SystemExit(7)"]]))
 """
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=120).returncode == 7
+
+
+def test_nodes_end_with_whoever_started_them() -> None:
+    node = """
+import ctypes
+from thegra_ros.environment import end_with_supervisor
+end_with_supervisor()
+print("computes", flush=True)
+ctypes.PyDLL(None).sleep(10**6)  # and holds Python's lock
+"""
+    code = "import sys; from thegra_ros.live import supervise; supervise([[sys.executable, '-c', sys.argv[1]]] * 2)"
+    with subprocess.Popen([sys.executable, "-c", code, node], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        assert [parent.stdout.readline() for _ in range(2)] == [b"computes\n"] * 2
+        parent.kill()
+        assert parent.stdout.read() == b"", "both held the other end, and are gone"
