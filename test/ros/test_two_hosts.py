@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from ros_graph import FAST, LIMIT_S
 
@@ -51,6 +52,8 @@ class Hosts:
             self._ip(host, "address", "add", f"10.77.0.{number}/24", "dev", self._links[host])
             for link in ("lo", self._links[host]):
                 self._ip(host, "link", "set", link, "up")
+        for host in self.names:
+            self.wait(lambda host=host: self._link(host)["operstate"] == "UP", "links that are up: a node does not look again for those that come up later")
         # two hosts share no memory: each has its own, in which only its own processes meet
         own_memory = "mount -t tmpfs tmpfs /dev/shm && echo && exec sleep infinity"
         self._hosts = {host: subprocess.Popen(["ip", "netns", "exec", name, "sh", "-c", own_memory], stdout=subprocess.PIPE) for host, name in self.names.items()}
@@ -86,8 +89,7 @@ class Hosts:
         self._ip("robot", "link", "set", "vr", state)
 
     def bytes_sent(self) -> int:
-        told = subprocess.run(["ip", "-n", self.names["robot"], "-s", "-j", "link", "show", "vr"], capture_output=True, text=True, check=True).stdout
-        return int(json.loads(told)[0]["stats64"]["tx"]["bytes"])
+        return int(self._link("robot")["stats64"]["tx"]["bytes"])
 
     def close(self) -> None:
         for process in (*self.processes.values(), *self._hosts.values()):
@@ -95,6 +97,11 @@ class Hosts:
             process.communicate()
         for name in self.names.values():
             subprocess.run(["ip", "netns", "delete", name], capture_output=True, check=False)
+
+    def _link(self, host: str) -> dict[str, Any]:
+        told = subprocess.run(["ip", "-n", self.names[host], "-s", "-j", "link", "show", self._links[host]], capture_output=True, text=True, check=True).stdout
+        link: dict[str, Any] = json.loads(told)[0]
+        return link
 
     def _ip(self, host: str, *arguments: str) -> None:
         ip("-n", self.names[host], *arguments)
