@@ -23,7 +23,8 @@ SAMPLES = 100
 """Draws of three landmarks; with half of them wrong, one draw in eight is right."""
 EPIPOLAR_CHI2 = 3.841
 """95 % of chi-square with the one degree of freedom that a match without a landmark has."""
-_DELTA = 1e-6
+_TURNS = np.stack([poses.skew(axis) for axis in np.eye(3)])
+"""(3, 3, 3): how a small turn about each axis moves a vector."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,10 +172,7 @@ def _system(
         np.repeat(landmarks.weights[front], 2),
         focal * pose_jacobian(points).reshape(-1, 6),
     )]  # fmt: skip
-    for view in shared:
-        center = _sampson(pose, view)
-        columns = [(_sampson(_moved(pose, d), view) - _sampson(_moved(pose, -d), view)) / (2 * _DELTA) for d in _DELTA * np.eye(6)]
-        parts.append((focal * center, view.weights, focal * np.stack(columns, axis=1)))
+    parts += [(focal * _sampson(pose, view), view.weights, focal * _sampson_jacobian(pose, view)) for view in shared]
     residuals, weights, jacobian = (np.concatenate(x) for x in zip(*parts, strict=True))
     return residuals, weights, jacobian
 
@@ -182,6 +180,20 @@ def _system(
 def _sampson(pose: FloatArray, view: SharedView) -> FloatArray:
     """Signed Sampson distances (M,) on the plane z = 1."""
     return epipolar.signed_sampson_errors(epipolar.essential(pose @ poses.inverse(view.camera_from_world)), view.there, view.here)
+
+
+def _sampson_jacobian(pose: FloatArray, view: SharedView) -> FloatArray:
+    """(M, 6) of `_sampson` by a left perturbation of the pose. The distance does not change with the length of the translation, so that this is taken as it is."""
+    relative = pose @ poses.inverse(view.camera_from_world)
+    rotation, essential = relative[:3, :3], poses.skew(relative[:3, 3]) @ relative[:3, :3]
+    changes = np.concatenate((_TURNS @ essential, _TURNS @ rotation))
+    there, here = epipolar.homogeneous(view.there), epipolar.homogeneous(view.here)
+    lines_here, lines_there = there @ essential.T, here @ essential
+    moved_here, moved_there = there @ changes.transpose(0, 2, 1), here @ changes  # (6, M, 3)
+    algebraic = (lines_here * here).sum(axis=1)
+    squared = np.maximum((lines_here[:, :2] ** 2).sum(axis=1) + (lines_there[:, :2] ** 2).sum(axis=1), 1e-30)
+    stretch = (moved_here[..., :2] * lines_here[:, :2]).sum(axis=2) + (moved_there[..., :2] * lines_there[:, :2]).sum(axis=2)
+    return np.asarray((((moved_here * here).sum(axis=2) - algebraic / squared * stretch) / np.sqrt(squared)).T)
 
 
 def _moved(pose: FloatArray, step: FloatArray) -> FloatArray:
