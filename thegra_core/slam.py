@@ -41,8 +41,7 @@ from thegra_core.messages import (
     TrackingState,
 )
 from thegra_core.optimization.solver import BundleSolver
-from thegra_core.preprocessing.chain import Chain
-from thegra_core.preprocessing.shutter import ShutterDetector
+from thegra_core.preprocessing.stage import Prepared, PreprocessingStage
 from thegra_core.process import Usage
 from thegra_core.snapshots import SnapshotKeeper
 from thegra_core.tracking.fixed_pattern import FixedPatternMask
@@ -51,8 +50,6 @@ from thegra_core.tracking.stage import TrackingOutput, TrackingStage
 FloatArray = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 _NO_POSE = (TrackingState.INITIALIZING, TrackingState.LOST, TrackingState.RELOCALIZING)
-BACKWARD_FRAMES = 3
-"""Backward stamps in a row that are refused before time is believed to have been set back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,8 +103,7 @@ class Slam:
         solver: BundleSolver | None = None,
     ) -> None:
         self._camera = camera
-        self._chain = Chain(config.preprocessing)
-        self._shutter = ShutterDetector(config.preprocessing.shutter)
+        self._preprocessing = PreprocessingStage(config.preprocessing, camera.image_size)
         self._fixed_pattern = FixedPatternMask()
         self._masks = config.tracking.mask_fixed_pattern
         self._extractor = TurnableExtractor(extractor if extractor is not None else make_extractor(config.extractor))
@@ -120,8 +116,6 @@ class Slam:
         self._tracking = TrackingStage(camera, config, self._matcher, self._mapping.submit, self._thorough)
         self._frames: list[_Placed] = []
         self._keep_records = keep_records
-        self._last_stamp_ns: int | None = None
-        self._backward, self._backward_ns = 0, None  # type: int, int | None
         self._bad: Counter[str] = Counter()
         self._revisits: list[Revisit] = []
         self._closures: list[tuple[int, int]] = []
@@ -134,10 +128,9 @@ class Slam:
         """Let everything that is made at its first use be made, and wait for the process of mapping: a live stream waits for nothing."""
         width, height = self._camera.image_size
         noise = np.random.default_rng(0).integers(0, 255, (height, width), np.uint8)
-        features = self._extractor.extract(self._chain(noise, 0), 0)
+        features = self._extractor.extract(noise, 0)
         for matcher in filter(None, (self._matcher, self._thorough)):
             matcher.match(features, features)
-        self._chain.reset()
         self._mapping.usage()
 
     def usage(self) -> Usage:
@@ -150,30 +143,34 @@ class Slam:
 
     def process(self, frame: Frame) -> TrackingResult:
         """One frame through all stages; never raises for what an image holds. Bad frames are counted and change nothing."""
+        return self.track(self.prepare(frame))
+
+    def prepare(self, frame: Frame) -> Prepared:
+        """The first stage alone. It depends on no other: frames may be prepared by a thread of their own, in the order in which they are tracked."""
+        return self._preprocessing.process(frame)
+
+    def track(self, prepared: Prepared) -> TrackingResult:
+        """A prepared frame through all stages but the first, see `process`."""
         begin = time.perf_counter()
-        self._stage_ms = {}
+        frame, shutter = prepared.frame, prepared.shutter
+        self._stage_ms = dict(prepared.stage_ms)
         self._view = None
-        trouble = self._trouble(frame)
-        if trouble:
-            self._bad[trouble] += 1
+        if shutter is None:
+            self._bad[prepared.trouble] += 1
             state = TrackingState.INITIALIZING if self._tracking.map_id < 0 else TrackingState.LOST
-            output = TrackingOutput(TrackingResult(frame.stamp_ns, state, reason=trouble))
+            output = TrackingOutput(TrackingResult(frame.stamp_ns, state, reason=prepared.trouble))
         else:
-            self._last_stamp_ns, self._backward = frame.stamp_ns, 0
-            with self._timed("shutter"):
-                shutter = self._shutter.update(frame)
             self._note_closure(shutter)
             if shutter.recalibrated:
-                self._chain.reset()
                 self._fixed_pattern.forget()
             if shutter.shutter is Shutter.JUST_OPENED:
                 self._tracking.reopen()
-            output = self._hold(frame, shutter) if shutter.shutter is Shutter.CLOSED else self._see(frame)
+            output = self._hold(frame, shutter) if prepared.image is None else self._see(frame, prepared.image)
             with self._timed("mapping"):
                 self._take_updates()
-        self._stage_ms["total"] = 1e3 * (time.perf_counter() - begin)
+        self._stage_ms["total"] = sum(prepared.stage_ms.values()) + 1e3 * (time.perf_counter() - begin)
         result = replace(output.result, stage_ms=dict(self._stage_ms))
-        self._record(frame.index, result, output.provisional, bad=bool(trouble))
+        self._record(frame.index, result, output.provisional, bad=shutter is None)
         return result
 
     @property
@@ -256,9 +253,7 @@ class Slam:
             self._take_updates()
         return self._tracking.hold(frame.stamp_ns, shutter.reason)
 
-    def _see(self, frame: Frame) -> TrackingOutput:
-        with self._timed("preprocessing"):
-            image = self._chain(frame.image, frame.stamp_ns)
+    def _see(self, frame: Frame, image: NDArray[np.uint8]) -> TrackingOutput:
         if self._extractor.turns != self._tracking.turns:  # nothing that was found in images turned otherwise is followed on
             self._extractor.turns = self._tracking.turns
             self._front_end.forget()
@@ -328,25 +323,6 @@ class Slam:
     def _take(self, update: MapUpdate) -> None:
         self._tracking.apply(update)
         self._follow(update)
-
-    def _trouble(self, frame: Frame) -> str:
-        """What is wrong with a frame, or an empty string."""
-        width, height = self._camera.image_size
-        if frame.image.ndim != 2 or frame.image.shape != (height, width):
-            return "image size differs from the camera's"
-        if frame.image.dtype.kind == "f" and not np.all(np.isfinite(frame.image)):
-            return "image holds NaN or infinity"
-        if self._last_stamp_ns is not None and frame.stamp_ns == self._last_stamp_ns:
-            return "stamp repeats"
-        if self._last_stamp_ns is not None and frame.stamp_ns < self._last_stamp_ns and not self._new_epoch(frame.stamp_ns):
-            return "stamp goes backwards"
-        return ""
-
-    def _new_epoch(self, stamp_ns: int) -> bool:
-        """Whether enough backward stamps in a row ascend among themselves: then the clock was set, or one stamp was wrong, and time goes on from here."""
-        self._backward = self._backward + 1 if self._backward_ns is not None and stamp_ns > self._backward_ns else 1
-        self._backward_ns = stamp_ns
-        return self._backward > BACKWARD_FRAMES
 
     def _note_closure(self, shutter: ShutterState) -> None:
         if shutter.shutter is Shutter.JUST_OPENED and self._frames and self._frames[-1].result.state is not TrackingState.HOLD:

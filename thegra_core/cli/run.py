@@ -25,6 +25,7 @@ from thegra_core.outputs.metrics import Timing
 from thegra_core.outputs.trajectory import NS_PER_S, read_tum
 from thegra_core.outputs.viewer import Viewer, make_viewer
 from thegra_core.outputs.write import RecordingFacts, write_run
+from thegra_core.preprocessing.stage import Prepared
 from thegra_core.process import Usage, set_threads
 from thegra_core.sources.open import camera_for, open_recording
 from thegra_core.sources.playback import Playback
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
     from thegra_core.features.protocols import Extractor, Matcher
 
 _log = logging.getLogger(__name__)
+READ_AHEAD = 2
+"""Frames of a recording that are read and pre-processed before they are asked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +74,8 @@ class System(Protocol):
     localization_only: bool
 
     def warm_up(self) -> None: ...
-    def process(self, frame: Frame) -> TrackingResult: ...
+    def prepare(self, frame: Frame) -> Prepared: ...
+    def track(self, prepared: Prepared) -> TrackingResult: ...
     def snapshot(self) -> Snapshot | None: ...
     def current_map(self) -> MapSummary | None: ...
     def map_size(self) -> tuple[int, int]: ...
@@ -129,7 +133,7 @@ def run_recording(options: RunOptions) -> int:
                 system.warm_up()
                 done, wall_s = _play(system, frames, recording, progress, viewer, interrupted)
             else:
-                done, wall_s = _process(system, read_ahead(frames), recording, progress, viewer, interrupted)
+                done, wall_s = _process(system, read_ahead(map(system.prepare, frames), READ_AHEAD), recording, progress, viewer, interrupted)
             if done.frames == 0 and done.interrupted:
                 raise KeyboardInterrupt
             if done.frames == 0:
@@ -199,22 +203,23 @@ def _play(
     """As `_process`, at the recording's own rate; frames that come too fast are dropped."""
     latency_ms: list[float] = []
     with Playback(frames) as playback:
-        done, wall_s = _process(system, iter(playback), recording, progress, viewer, interrupted, lambda: latency_ms.append(playback.latency_ms()))
+        prepared = read_ahead(map(system.prepare, playback), 1)
+        done, wall_s = _process(system, prepared, recording, progress, viewer, interrupted, lambda frame: latency_ms.append(playback.latency_ms(frame)))
     done.dropped, done.latency_ms = playback.dropped, latency_ms
     return done, wall_s
 
 
 def _process(
-    system: System, frames: Iterator[Frame], recording: Recording, progress: Progress, viewer: Viewer, interrupted: Callable[[], bool],
-    processed: Callable[[], None] = lambda: None,
+    system: System, frames: Iterator[Prepared], recording: Recording, progress: Progress, viewer: Viewer, interrupted: Callable[[], bool],
+    processed: Callable[[Frame], None] = lambda _: None,
 ) -> tuple[_Done, float]:
     """All frames through the system, `processed` called after each; returns also the seconds it took."""
     done, news, before = _Done(), News(), dict(recording.problems)
     begin, cpu_begin = time.perf_counter(), time.process_time() + system.usage().cpu_s
     try:
-        for frame in frames:
-            result = system.process(frame)
-            processed()
+        for prepared in frames:
+            frame, result = prepared.frame, system.track(prepared)
+            processed(frame)
             done.frames += 1
             done.reason = result.reason or done.reason
             if news.is_new(result):

@@ -26,7 +26,7 @@ PARAMETERS = 6
 MOST_GROWN = 1.5
 """Factor in size, either way, beyond which a square has too few pixels or too many to be compared well."""
 _ROUNDS, _CONVERGED_PX, _DAMPING, _LEAST, _FLAT = 8, 0.03, 1e-3, 1e-12, 1e-3
-_compile = numba.njit(cache=True, fastmath=True, error_model="numpy")
+_compile = numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 _IMAGE = numba.types.Array(numba.uint8, 2, "C", readonly=True)  # those of messages are
 _VECTOR, _MATRIX, _CUBE = numba.float32[::1], numba.float32[:, ::1], numba.float32[:, :, ::1]
 
@@ -117,7 +117,7 @@ def _between(image: Image, x: float, y: float) -> float:
     return value
 
 
-@numba.njit(numba.void(_IMAGE, _MATRIX, numba.int64, _MATRIX, _CUBE), cache=True, fastmath=True, error_model="numpy")
+@numba.njit(numba.void(_IMAGE, _MATRIX, numba.int64, _MATRIX, _CUBE), cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _prepare(image: Image, points: Points, size: int, squares: FloatArray, all_slopes: FloatArray) -> None:
     """The squares, and how each pixel changes with each parameter; nothing changes where a square is flat."""
     half, pixels = (size - 1) / 2, size * size
@@ -166,7 +166,7 @@ def _see(image: Image, size: int, x: float, y: float, a: float, b: float, c: flo
             k += 1
 
 
-@numba.njit(numba.void(_IMAGE, _MATRIX, _CUBE, numba.float64, numba.float64, _MATRIX, _CUBE, _VECTOR, numba.boolean[::1]), cache=True, fastmath=True, error_model="numpy")
+@numba.njit(numba.void(_IMAGE, _MATRIX, _CUBE, numba.float64, numba.float64, _MATRIX, _CUBE, _VECTOR, numba.boolean[::1]), cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _lay(
     image: Image, squares: FloatArray, steps: FloatArray, least_similarity: float, most_px: float, points: Points, warps: FloatArray, similarity: FloatArray, exact: BoolArray,
 ) -> None:  # fmt: skip

@@ -44,7 +44,7 @@ def normalize_contrast(image: Image) -> Image:
     return normalized
 
 
-@numba.njit(numba.void(_IMAGE, numba.float32[:, ::1], numba.float32[:, ::1], numba.uint8[:, ::1]), cache=True, fastmath=True, error_model="numpy")  # compiled before a camera runs
+@numba.njit(numba.void(_IMAGE, numba.float32[:, ::1], numba.float32[:, ::1], numba.uint8[:, ::1]), cache=True, nogil=True, fastmath=True, error_model="numpy")  # compiled before a camera runs
 def _normalize(image: Image, mean: NDArray[np.float32], mean_square: NDArray[np.float32], normalized: Image) -> None:
     middle, levels, least, most = np.float32(128), np.float32(CONTRAST_LEVELS), np.float32(LEAST_VARIANCE), np.float32(255)
     for row in range(image.shape[0]):

@@ -15,7 +15,7 @@ Float32Array = NDArray[np.float32]
 _TAU = np.float32(0.25)
 _ONE = np.float32(1)
 # Images are finite, and a sum may be taken in any order: then a loop becomes vector instructions.
-_compile = numba.njit(cache=True, fastmath=True, error_model="numpy")
+_compile = numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 
 
 def denoise(values: Float32Array, weight: float, eps: float, max_iterations: int) -> Float32Array:

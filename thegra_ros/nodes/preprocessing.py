@@ -8,9 +8,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
 
-from thegra_core.messages import Frame, Shutter
-from thegra_core.preprocessing.chain import Chain
-from thegra_core.preprocessing.shutter import ShutterDetector
+from thegra_core.messages import Frame
+from thegra_core.preprocessing.stage import PreprocessingStage
 from thegra_ros.codec.images import image_message
 from thegra_ros.codec.shutter import FrameNotice, notice_message
 from thegra_ros.codec.stamps import header
@@ -46,16 +45,13 @@ class PreprocessingNode(StageNode):
         if frame is None:
             self._fresh()
             return
-        if self._last_ns is not None and frame.stamp_ns <= self._last_ns:
-            self.health.bad["stamp repeats or goes back"] += 1
+        prepared = self._stage.process(frame)
+        if prepared.shutter is None:
+            self.health.bad[prepared.trouble] += 1
             return
-        self._last_ns = frame.stamp_ns
-        state = self._shutter.update(frame)
-        if state.recalibrated:
-            self._chain.reset()
-        self._notices.publish(notice_message(FrameNotice(state, self._epoch, frame_id)))
-        if state.shutter is not Shutter.CLOSED:
-            self._images.publish(image_message(header(frame.stamp_ns, frame_id), self._chain(frame.image, frame.stamp_ns)))
+        self._notices.publish(notice_message(FrameNotice(prepared.shutter, self._epoch, frame_id)))
+        if prepared.image is not None:
+            self._images.publish(image_message(header(frame.stamp_ns, frame_id), prepared.image))
 
     def begin_anew(self, why: str) -> None:
         self._fresh()
@@ -76,7 +72,7 @@ class PreprocessingNode(StageNode):
 
     def _fresh(self) -> None:
         self._epoch += 1
-        self._chain, self._shutter, self._last_ns = Chain(self.config.preprocessing), ShutterDetector(self.config.preprocessing.shutter), None
+        self._stage = PreprocessingStage(self.config.preprocessing)
 
 
 def main() -> None:
