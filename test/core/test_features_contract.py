@@ -9,6 +9,8 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from thegra_core.config import ExtractorConfig, MatcherConfig
@@ -189,6 +191,24 @@ def test_sparse_aliked_is_the_published_network() -> None:
     torch.testing.assert_close(found, expected, atol=5e-5, rtol=0)
 
 
+def test_xfeat_finds_what_its_own_pipeline_finds() -> None:
+    """Of the same network: kornia describes all candidates, we only those that stay."""
+    require("xfeat")
+    import torch
+    from kornia.feature import XFeat
+
+    from thegra_core.features.checkpoint import load_checkpoint
+
+    image = view(size=(320, 224))  # multiples of 32: the network sees it as it is
+    pipeline = XFeat(top_k=200)
+    pipeline.net.load_state_dict(load_checkpoint("xfeat"))
+    expected = pipeline.eval().detectAndCompute(torch.from_numpy(image.astype(np.float32))[None, None] / 255)[0]
+    features = make_extractor(ExtractorConfig(name="xfeat", max_keypoints=200, border=0, crowding=0)).extract(image, 0)
+    np.testing.assert_allclose(features.keypoints, expected["keypoints"], atol=1e-4)
+    np.testing.assert_allclose(features.scores, expected["scores"], atol=1e-5)
+    np.testing.assert_allclose(features.descriptors, expected["descriptors"], atol=1e-4)
+
+
 def test_superpoint_finds_isolated_maxima_and_their_centres() -> None:
     from thegra_core.features.detection import centroids, strongest, suppress
 
@@ -202,6 +222,22 @@ def test_superpoint_finds_isolated_maxima_and_their_centres() -> None:
     np.testing.assert_allclose(values, [0.9, 0.5])
     np.testing.assert_allclose(centroids(scores, keypoints), [[30.25, 20], [36, 20]])
     assert strongest(peaks, 1, 0.6, border=0)[0].tolist() == [[2, 2]]
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), levels=st.integers(2, 50))
+def test_strict_maxima_are_higher_than_all_around_them(seed: int, levels: int) -> None:
+    from thegra_core.features.detection import strict_maxima
+
+    scores = np.random.default_rng(seed).integers(0, levels, (13, 17)).astype(np.float32)  # with many ties
+    expected = []
+    for y in range(2, 11):
+        for x in range(2, 15):
+            around = scores[y - 2 : y + 3, x - 2 : x + 3].copy()
+            around[2, 2] = -1
+            if scores[y, x] > max(around.max(), 1.0):
+                expected.append([x, y])
+    assert strict_maxima(scores, 2, 1.0).tolist() == expected
 
 
 def test_suppressed_neighbours_do_not_hide_the_points_behind_them() -> None:

@@ -51,20 +51,35 @@ def assemble(
         scores: (N,), clipped into (0, 1].
         descriptors: (N, D) float32 or uint8.
     """
+    usable = np.asarray(np.isfinite(descriptors).all(axis=1))
+    raw, chosen = selected(config, image_size, scale, keypoints, scores, usable)
+    return described(config, stamp_ns, image_size, raw, scores[chosen], descriptors[chosen])
+
+
+def selected(
+    config: ExtractorConfig, image_size: tuple[int, int], scale: tuple[float, float], keypoints: NDArray[np.float32], scores: NDArray[np.float32], usable: NDArray[np.bool_],
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The first part of `assemble`, for what is described only once it is chosen: of the detections that are `usable` (N,) those that stay, as pixels (M, 2) of the
+    raw image and as rows (M,)."""
     raw = keypoints.astype(np.float64)
     if scale != (1.0, 1.0):
         raw = (raw + 0.5) / np.asarray(scale) - 0.5
     limits = np.asarray(image_size, np.float64) - 1 - config.border
-    keep = np.isfinite(raw).all(axis=1) & np.isfinite(scores) & (raw >= config.border).all(axis=1) & (raw <= limits).all(axis=1)
-    if descriptors.dtype == np.float32:
-        keep &= np.isfinite(descriptors).all(axis=1)
+    keep = usable & np.isfinite(raw).all(axis=1) & np.isfinite(scores) & (raw >= config.border).all(axis=1) & (raw <= limits).all(axis=1)
     chosen = np.flatnonzero(keep)
     chosen = chosen[spread(raw[chosen], scores[chosen], config.max_keypoints, image_size, config.crowding)]
+    return raw[chosen], chosen
+
+
+def described(
+    config: ExtractorConfig, stamp_ns: int, image_size: tuple[int, int], raw: NDArray[np.float64], scores: NDArray[np.float32], descriptors: NDArray[np.float32] | NDArray[np.uint8],
+) -> Features:  # fmt: skip
+    """The second part of `assemble`: pixels (M, 2) of the raw image, scores (M,) and descriptors (M, D) as features."""
     return Features(
         stamp_ns=stamp_ns,
-        keypoints=np.ascontiguousarray(raw[chosen], np.float32),
-        scores=np.clip(scores[chosen].astype(np.float32), MIN_SCORE, np.float32(1)),
-        descriptors=descriptors[chosen],
+        keypoints=np.ascontiguousarray(raw, np.float32),
+        scores=np.clip(scores.astype(np.float32), MIN_SCORE, np.float32(1)),
+        descriptors=descriptors,
         image_size=image_size,
         extractor=config.name,
     )

@@ -26,6 +26,16 @@ def suppress(scores: Scores, radius: int, rounds: int = 2) -> Scores:
     return np.where(peaks, scores, np.float32(0))
 
 
+def strict_maxima(scores: Scores, radius: int, threshold: float) -> NDArray[np.int64]:
+    """(N, 2) (x, y) whole pixels, in raster order, of the values of (H, W) above `threshold` that are higher than all others of the (2 radius + 1) square around them,
+    which has to lie inside."""
+    others = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    others[radius, radius] = 0
+    inside = np.s_[radius:-radius, radius:-radius]
+    rows, columns = np.nonzero((scores[inside] > np.asarray(cv2.dilate(scores, others))[inside]) & (scores[inside] > threshold))
+    return np.stack((columns + radius, rows + radius), axis=1)
+
+
 def strongest(peaks: Scores, count: int, threshold: float, border: int) -> tuple[NDArray[np.int64], Scores]:
     """The `count` highest of the positive values of (H, W) above `threshold`, at least `border` px inside.
 

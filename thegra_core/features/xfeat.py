@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from kornia.feature import XFeat as XFeatPipeline
 from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
 
 from thegra_core.config import ExtractorConfig
-from thegra_core.features.assemble import assemble, scaled_image
+from thegra_core.features.assemble import described, scaled_image, selected
 from thegra_core.features.backends import Compiled, Replaced, chosen, export, exported_path
 from thegra_core.features.checkpoint import load_checkpoint, load_exactly
+from thegra_core.features.detection import strict_maxima
 from thegra_core.features.device import resolve_device
 from thegra_core.messages import Features
 
 _MULTIPLE = 32
+NMS_RADIUS = 2
+CANDIDATES = 4
+"""Times as many detections as keypoints among which these are spread."""
 OUTPUTS = ("features", "keypoints", "reliability")
 """Maps of the network, in its order."""
 
@@ -29,27 +34,57 @@ class XFeat:
         self.name: str = config.name
         self._config = config
         self._device = resolve_device(config.device)
-        pipeline: Any = XFeatPipeline(top_k=config.max_keypoints, detection_threshold=config.detection_threshold)
-        load_exactly(pipeline.net, load_checkpoint("xfeat"), "xfeat")
-        self._pipeline = pipeline.eval().to(self._device)
+        network = _network().to(self._device)
         runtime = chosen(config.backend, self._device)
         if runtime != "torch":
-            self._pipeline.net = Replaced(Compiled(self._pipeline.net, "xfeat", OUTPUTS, runtime, torch.get_num_threads()))
+            network = Replaced(Compiled(network, "xfeat", OUTPUTS, runtime, torch.get_num_threads()))
+        self._network = network
 
     @torch.inference_mode()
     def extract(self, image: NDArray[np.uint8], stamp_ns: int) -> Features:
-        """See `Extractor.extract`."""
-        config = self._config
+        """See `Extractor.extract`. What is not chosen is not described: it takes as long as all the rest beside the network."""
+        config, image_size = self._config, (image.shape[1], image.shape[0])
         scaled, scale = scaled_image(image, config.long_side)
         grey = torch.from_numpy(np.ascontiguousarray(scaled)).to(self._device).float()[None, None] / 255
-        found = self._pipeline.detectAndCompute(grey, top_k=4 * config.max_keypoints, detection_threshold=config.detection_threshold)[0]
-        size = np.asarray([scaled.shape[1], scaled.shape[0]])
-        seen = np.asarray(network_size((scaled.shape[1], scaled.shape[0])))
-        # kornia scales pixel indices by the size ratio; pixel centres move by half the difference besides
-        keypoints = found["keypoints"].cpu().numpy() + 0.5 * size / seen - 0.5
-        return assemble(
-            config, stamp_ns, (image.shape[1], image.shape[0]), scale, keypoints, found["scores"].cpu().numpy(), found["descriptors"].cpu().numpy()
-        )
+        size = (scaled.shape[1], scaled.shape[0])
+        seen = network_size(size)
+        grey = functional.interpolate(grey, seen[::-1], mode="bilinear", align_corners=False)
+        descriptors, logits, reliability = (found.cpu() for found in self._network(grey))
+        heat = _heat_map(logits)
+        maxima = strict_maxima(heat[0, 0].numpy(), NMS_RADIUS, config.detection_threshold)
+        pixels = torch.from_numpy(maxima)
+        scores = (_sampled(heat, pixels, seen, "nearest") * _sampled(reliability, pixels, seen, "bilinear"))[:, 0].numpy()
+        strongest = np.argsort(-scores, kind="stable")[: CANDIDATES * config.max_keypoints]
+        strongest = strongest[scores[strongest] > 0]
+        maxima, scores = maxima[strongest], scores[strongest]
+        ratio = np.asarray(size) / np.asarray(seen)
+        raw, rows = selected(config, image_size, scale, (maxima + 0.5) * ratio - 0.5, scores, np.ones(len(scores), bool))
+        vectors = _sampled(functional.normalize(descriptors, dim=1), torch.from_numpy(maxima[rows]), seen, "bicubic")
+        return described(config, stamp_ns, image_size, raw, scores[rows], functional.normalize(vectors, dim=-1).numpy())
+
+
+def _network() -> nn.Module:
+    """The network that makes the maps, with its weights.
+
+    Raises:
+        WeightsError: If they are not in the cache.
+    """
+    network: nn.Module = XFeatPipeline().net
+    load_exactly(network, load_checkpoint("xfeat"), "xfeat")
+    return network.eval()
+
+
+def _heat_map(logits: Tensor) -> Tensor:
+    """(1, 1, 8 H, 8 W) probability of a keypoint from (1, 65, H, W): each cell's 64 pixels, and one for none of them."""
+    height, width = logits.shape[2:]
+    cells = functional.softmax(logits, 1)[:, :64].permute(0, 2, 3, 1).reshape(1, height, width, 8, 8)
+    return cells.permute(0, 1, 3, 2, 4).reshape(1, 1, 8 * height, 8 * width)
+
+
+def _sampled(values: Tensor, pixels: Tensor, size: tuple[int, int], mode: str) -> Tensor:
+    """(N, C) of a map (1, C, h, w) at pixels (N, 2) of an image of `size` (width, height), where the weights were trained to look: half a pixel beside its centre."""
+    grid = 2.0 * pixels.float() / (torch.tensor(size) - 1) - 1.0
+    return functional.grid_sample(values, grid[None, :, None], mode=mode, align_corners=False)[0, :, :, 0].T
 
 
 def network_size(image_size: tuple[int, int]) -> tuple[int, int]:
@@ -66,7 +101,5 @@ def export_xfeat(image_size: tuple[int, int]) -> Path:
         ConfigError: If the packages that export are missing.
     """
     path = exported_path("xfeat", network_size(image_size))
-    pipeline = XFeatPipeline()
-    load_exactly(pipeline.net, load_checkpoint("xfeat"), "xfeat")
-    export(pipeline.net.eval(), network_size(image_size), OUTPUTS, path)
+    export(_network(), network_size(image_size), OUTPUTS, path)
     return path
