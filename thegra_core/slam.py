@@ -49,6 +49,8 @@ from thegra_core.tracking.stage import TrackingOutput, TrackingStage
 
 FloatArray = NDArray[np.float64]
 logger = logging.getLogger(__name__)
+PATIENCE_S = 0.1
+"""How long a frame whose points see no landmarks waits for those of a keyframe that has just been made; to seek the camera takes longer, and is less sure."""
 _NO_POSE = (TrackingState.INITIALIZING, TrackingState.LOST, TrackingState.RELOCALIZING)
 
 
@@ -291,6 +293,9 @@ class Slam:
                 matches = self._unmasked(features, reference, shared_tracks(features, reference)) if reference is not None else None
             with self._timed("tracking"):
                 output = self._tracking.process_followed(features, matches)
+            while self._tracking.lacks_landmarks and self._landmarks_come():
+                with self._timed("tracking"):
+                    output = self._tracking.process_followed(features, matches)
             if isinstance(output, TrackingOutput):
                 return features, output
             wanted = output
@@ -316,9 +321,16 @@ class Slam:
             known = self._tracking.map
             return ({known.map_id: known} if known is not None and known.keyframes else {}), (0, 0)
 
-    def _take_updates(self) -> None:
-        for update in self._mapping.updates():
+    def _landmarks_come(self) -> bool:
+        with self._timed("mapping"):
+            return self._take_updates(PATIENCE_S)
+
+    def _take_updates(self, patience_s: float = 0.0) -> bool:
+        """Whether there were any."""
+        updates = self._mapping.updates(patience_s)
+        for update in updates:
             self._take(update)
+        return bool(updates)
 
     def _take(self, update: MapUpdate) -> None:
         self._tracking.apply(update)

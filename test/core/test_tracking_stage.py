@@ -29,7 +29,10 @@ class PairByHalves(Pair):
         insert = self.mapper.insert
 
         def by_halves(keyframe: Keyframe) -> MapUpdate:
-            self.tracking.apply(self.mapper.grow(keyframe))
+            updates = list(self.mapper.grow(keyframe))
+            assert len(updates) == 2, "of the matches that tracking made, and of the others"
+            for update in updates:
+                self.tracking.apply(update)
             return self.mapper.settle(keyframe)
 
         self.mapper.insert = by_halves  # type: ignore[method-assign]

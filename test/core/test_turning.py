@@ -235,7 +235,7 @@ class LateMapping(InlineMapping):
         super().__init__(mapper)
         self._waiting: list[list[MapUpdate]] = [[] for _ in range(looks)]
 
-    def updates(self) -> list[MapUpdate]:
+    def updates(self, patience_s: float = 0.0) -> list[MapUpdate]:
         self._waiting.append(super().updates())
         return self._waiting.pop(0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -73,15 +74,18 @@ class DetectAndFollow:
         self._config = config
         self._trail: _Trail | None = None
         self._next_id = 0
+        self._beside = ThreadPoolExecutor(1, "thegra detecting")
+        self._early: Future[Features] | None = None
 
     def follow(self, image: Image, stamp_ns: int) -> Features | None:
         """See `FrontEnd.follow`."""
         normalized, before = normalize_contrast(image), self._trail
+        self._early = None
         if before is None or before.normalized.shape != image.shape:
             nothing = _none(stamp_ns, image)
             self._trail = _Trail(image, normalized, nothing, self._anchored(normalized, nothing), 0)
             return None
-        followed, anchors = self._followed(before, normalized, stamp_ns)
+        followed, anchors = self._followed(before, image, normalized, stamp_ns)
         self._trail = _Trail(image, normalized, followed, anchors, before.detected)
         return followed if len(followed) >= max(self._config.min_points, self._config.min_share * before.detected) else None
 
@@ -89,7 +93,7 @@ class DetectAndFollow:
         """See `FrontEnd.detect`."""
         assert self._trail is not None
         trail = self._without_worn(self._trail)
-        found = self._extractor.extract(trail.image, trail.features.stamp_ns)
+        found = (self._early or self._detecting(trail.image, trail.features.stamp_ns)).result()
         candidates = spread(found.keypoints, found.scores, self._config.max_points, found.image_size, CROWDING)
         ids = np.full(len(found), UNFOLLOWED, np.int64)
         ids[candidates] = NEW
@@ -107,12 +111,20 @@ class DetectAndFollow:
         """See `FrontEnd.forget`."""
         self._trail = None
 
-    def _followed(self, before: _Trail, normalized: Image, stamp_ns: int) -> tuple[Features, Anchors]:
-        """The points found: each where its square lies, if that can be said, else where the step from the last image has led."""
+    def _detecting(self, image: Image, stamp_ns: int) -> Future[Features]:
+        """Detection, by a thread of its own: one at a time."""
+        return self._beside.submit(self._extractor.extract, image, stamp_ns)
+
+    def _followed(self, before: _Trail, image: Image, normalized: Image, stamp_ns: int) -> tuple[Features, Anchors]:
+        """The points found: each where its square lies, if that can be said, else where the step from the last image has led.
+
+        Where they have to be sought with more effort the image will most likely have to be detected in, too, which begins meanwhile.
+        """
         points, images = before.features.keypoints, (before.normalized, normalized)
         there, inside = step(*images, points, points + coarse_shift(*images), self._config)
         result, exact, anchors = self._checked(before, normalized, there, inside)
         if len(points) and result.found.mean() < self._config.far_share:
+            self._early = self._detecting(image, stamp_ns)
             far = follow_far(*images, points, result, self._config)
             result, exact, anchors = self._checked(before, normalized, far.points, far.found, far)
         chosen = np.flatnonzero(result.found)

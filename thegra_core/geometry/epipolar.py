@@ -21,9 +21,9 @@ def homogeneous(normalized: FloatArray) -> FloatArray:
 
 
 def essential(camera1_from_camera0: FloatArray) -> FloatArray:
-    """Essential matrix (3, 3) of a relative pose (4, 4), translation scaled to length 1."""
-    t = camera1_from_camera0[:3, 3]
-    return np.asarray(poses.skew(t / np.linalg.norm(t)) @ camera1_from_camera0[:3, :3])
+    """Essential matrices (..., 3, 3) of relative poses (..., 4, 4), translation scaled to length 1."""
+    t = camera1_from_camera0[..., :3, 3]
+    return np.asarray(poses.skew(t / np.linalg.norm(t, axis=-1, keepdims=True)) @ camera1_from_camera0[..., :3, :3])
 
 
 def sampson_errors(essential_matrix: FloatArray, normalized0: FloatArray, normalized1: FloatArray) -> FloatArray:

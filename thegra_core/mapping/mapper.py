@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +24,7 @@ from thegra_core.mapping.full_adjustment import FullAdjustments
 from thegra_core.mapping.loop_closing import LoopCloser
 from thegra_core.mapping.merging import MapMerger, merge
 from thegra_core.mapping.persistence import KeptMap, load_map, save_map
-from thegra_core.messages import Absorbed, InitialMap, Keyframe, MapSummary, MapUpdate, Matches
+from thegra_core.messages import Absorbed, InitialMap, Keyframe, MapSummary, MapUpdate
 from thegra_core.optimization.solver import BundleSolver, InlineSolver
 
 logger = logging.getLogger(__name__)
@@ -73,15 +75,16 @@ class Mapper:
 
     def insert(self, keyframe: Keyframe) -> MapUpdate:
         """Insert a keyframe: observations, culling, expansion with its neighbours, local bundle adjustment; then what it may tie together."""
-        self._grow(keyframe)
+        deque(self._grow(keyframe), maxlen=0)
         self._settle(keyframe)
         tied = self._tie(keyframe)
         return tied if tied is not None else self._editors[keyframe.map_id].take_update()
 
-    def grow(self, keyframe: Keyframe) -> MapUpdate:
-        """The first step of `insert`, for a tracker that waits for the new landmarks: they are not adjusted yet."""
-        self._grow(keyframe)
-        return self._editors[keyframe.map_id].take_update()
+    def grow(self, keyframe: Keyframe) -> Iterator[MapUpdate]:
+        """The first step of `insert`, for a tracker that waits for the new landmarks, which are not adjusted yet: first those of the matches that it made itself,
+        then those of the matches that had to be made."""
+        for _ in self._grow(keyframe):
+            yield self._editors[keyframe.map_id].take_update()
 
     def settle(self, keyframe: Keyframe) -> MapUpdate:
         """The second step, the local adjustment. It may be left out: that of a later keyframe takes in this one, its neighbour."""
@@ -94,15 +97,17 @@ class Mapper:
         tied = self._tie(keyframe)
         return self._editors[keyframe.map_id].take_update() if tied is None and self.loops != before else tied
 
-    def _grow(self, keyframe: Keyframe) -> None:
+    def _grow(self, keyframe: Keyframe) -> Iterator[None]:
+        """Stops where landmarks have come."""
         editor = self._editors[keyframe.map_id]
         editor.add_keyframe(keyframe)
         editor.connect(keyframe.id)
         self._cull(editor, keyframe)
-        self._expand(editor, keyframe)
+        yield from self._expand(editor, keyframe)
         editor.connect(keyframe.id)
         self._thin(editor, keyframe.id)
         self._loops[keyframe.map_id].index.add(keyframe.id, keyframe.features)
+        yield
 
     def _settle(self, keyframe: Keyframe) -> None:
         """A full adjustment that is done comes in before the local one, which smooths the seams to what has come since."""
@@ -229,21 +234,21 @@ class Mapper:
             self._graphs[editor.map.map_id].remove(removed)
             self._loops[editor.map.map_id].index.remove(removed)
 
-    def _expand(self, editor: MapEditor, keyframe: Keyframe) -> None:
-        """Match the keyframe to its neighbours, the reference first, whose matches tracking already has, and through them to theirs."""
+    def _expand(self, editor: MapEditor, keyframe: Keyframe) -> Iterator[None]:
+        """Match the keyframe to its neighbours, the reference first, whose matches tracking already has, and through them to theirs; stops after the reference."""
         neighbours = self._choose_neighbours(editor, keyframe)
-        features = keyframe.features
-        known: dict[int, Matches] = {}
+        graph, before, count = self._graphs[keyframe.map_id], editor.next_landmark, self._config.mapping.neighbours
         if keyframe.reference_matches is not None and keyframe.reference_id in editor.map.keyframes:
-            known[keyframe.reference_id] = keyframe.reference_matches
-        open_ids = [i for i in neighbours if i not in known][: self._config.mapping.neighbours - len(known)]
-        matched = self._matcher.match_many(features, [editor.map.keyframes[i].features for i in open_ids])
-        known.update(zip(open_ids, matched, strict=True))
-        before = editor.next_landmark
-        graph = self._graphs[keyframe.map_id]
-        for neighbour, matches in known.items():
+            graph.add(keyframe.id, keyframe.reference_id, keyframe.reference_matches)
+            expand(editor, keyframe.id, keyframe.reference_id, keyframe.reference_matches, self._config.mapping)
+            neighbours, count = [i for i in neighbours if i != keyframe.reference_id], count - 1
+            yield
+        neighbours = neighbours[:count]
+        matched = self._matcher.match_many(keyframe.features, [editor.map.keyframes[i].features for i in neighbours])
+        known = list(zip(neighbours, matched, strict=True))
+        for neighbour, matches in known:
             graph.add(keyframe.id, neighbour, matches)
-        for other, matches in [*known.items(), *graph.chained(keyframe.id, self._config.mapping.chained_keyframes)]:
+        for other, matches in [*known, *graph.chained(keyframe.id, self._config.mapping.chained_keyframes)]:
             expand(editor, keyframe.id, other, matches, self._config.mapping)
         self._trial[keyframe.map_id].extend(range(before, editor.next_landmark))
 

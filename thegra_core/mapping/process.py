@@ -94,10 +94,11 @@ class MappingProcess:
         """See `MappingService.drop`."""
         self._tell("drop", map_id)
 
-    def updates(self) -> list[MapUpdate]:
+    def updates(self, patience_s: float = 0.0) -> list[MapUpdate]:
         """See `MappingService.updates`."""
-        while self._readable():
+        while self._readable(0.0 if self._updates else patience_s):
             self._take(self._receive())
+            patience_s = 0.0
         taken, self._updates = self._updates, []
         return taken
 
@@ -177,9 +178,9 @@ class MappingProcess:
             return
         self._updates.extend(content)
 
-    def _readable(self) -> bool:
+    def _readable(self, patience_s: float) -> bool:
         try:
-            return self._connection.poll()
+            return self._connection.poll(patience_s)
         except OSError as error:
             raise MappingError(self._epitaph()) from error
 

@@ -34,8 +34,8 @@ class MappingService(Protocol):
         """See `Mapper.drop`."""
         ...
 
-    def updates(self) -> list[MapUpdate]:
-        """The updates that have come since the last call, in order.
+    def updates(self, patience_s: float = 0.0) -> list[MapUpdate]:
+        """The updates that have come since the last call, in order; where there are none the next message is waited for, but no longer than `patience_s`.
 
         Raises:
             MappingError: If mapping has ended with an error.
@@ -105,7 +105,7 @@ class InlineMapping:
         if keyframe.map_id not in self._mapper.map_ids:
             return
         self._left += 1
-        yield self._mapper.grow(keyframe)
+        yield from self._mapper.grow(keyframe)
         if self._left <= MOST_LEFT and others_wait():
             return
         yield self._mapper.settle(keyframe)
@@ -120,8 +120,8 @@ class InlineMapping:
         """See `MappingService.drop`."""
         self._mapper.drop(map_id)
 
-    def updates(self) -> list[MapUpdate]:
-        """See `MappingService.updates`."""
+    def updates(self, patience_s: float = 0.0) -> list[MapUpdate]:
+        """See `MappingService.updates`; here nothing is under way."""
         taken, self._updates = self._updates, []
         return taken
 

@@ -94,7 +94,7 @@ def _agreement(drawn: list[FloatArray], landmarks: LandmarkView, shared: Sequenc
         squared = focal**2 * ((points[..., :2] / points[..., 2:] - landmarks.normalized) ** 2).sum(axis=2)
     scores = _truncated(np.where(points[..., 2] > 1e-9, squared, np.inf), threshold_px)
     for view in shared:
-        essentials = np.stack([epipolar.essential(pose @ poses.inverse(view.camera_from_world)) for pose in drawn])
+        essentials = epipolar.essential(stack @ poses.inverse(view.camera_from_world))
         there, here = epipolar.homogeneous(view.there), epipolar.homogeneous(view.here)
         lines_here, lines_there = there @ essentials.transpose(0, 2, 1), here @ essentials
         scale = (lines_here[..., :2] ** 2).sum(axis=2) + (lines_there[..., :2] ** 2).sum(axis=2)

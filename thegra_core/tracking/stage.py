@@ -90,6 +90,7 @@ class TrackingStage:
         self._next_map_id = 0
         self._unplaced: deque[Features] = deque(maxlen=config.relocalization.remembered_frames)
         self.localization_only = False
+        self.lacks_landmarks = False
         self.losses = 0
         self.relocalizations = 0
 
@@ -154,9 +155,10 @@ class TrackingStage:
         """Track one frame by keypoints that were followed to it; `matches` as for `process`.
 
         Instead of an answer, what `process` should get of the same image: more features if a keyframe is due or these give no pose, other ones if these are
-        wrong.
+        wrong. `lacks_landmarks` says whether these give no pose while mapping has yet to tell what a keyframe brought: it may be as well to wait for that.
         """
         place = self._place
+        self.lacks_landmarks = False
         if place is None:
             return self._start(features, matches)
         if not place.begun:
@@ -169,6 +171,7 @@ class TrackingStage:
         found = localize_followed(place.map, features, landmark_ids, predicted, self._config)
         if isinstance(found, NotPlaced):
             logger.debug("followed keypoints at %.3f s: %s", features.stamp_ns / 1e9, found.reason)
+            self.lacks_landmarks = bool(place.pending) and not found.misled
             return Wanted.ANEW if found.misled else Wanted.MORE
         if self._keyframe_due(place, found):
             return Wanted.MORE
