@@ -49,8 +49,8 @@ from thegra_core.tracking.stage import TrackingOutput, TrackingStage
 
 FloatArray = NDArray[np.float64]
 logger = logging.getLogger(__name__)
-PATIENCE_S = 0.1
-"""How long a frame whose points see no landmarks waits for those of a keyframe that has just been made; to seek the camera takes longer, and is less sure."""
+PATIENCE_S = 0.03
+"""How long a frame whose points see too few landmarks waits for those of keyframes that have just been made: as long as it takes to detect more points."""
 _NO_POSE = (TrackingState.INITIALIZING, TrackingState.LOST, TrackingState.RELOCALIZING)
 
 
@@ -293,7 +293,8 @@ class Slam:
                 matches = self._unmasked(features, reference, shared_tracks(features, reference)) if reference is not None else None
             with self._timed("tracking"):
                 output = self._tracking.process_followed(features, matches)
-            while self._tracking.lacks_landmarks and self._landmarks_come():
+            end = time.perf_counter() + PATIENCE_S
+            while self._tracking.lacks_landmarks and self._landmarks_come(end - time.perf_counter()):
                 with self._timed("tracking"):
                     output = self._tracking.process_followed(features, matches)
             if isinstance(output, TrackingOutput):
@@ -321,9 +322,9 @@ class Slam:
             known = self._tracking.map
             return ({known.map_id: known} if known is not None and known.keyframes else {}), (0, 0)
 
-    def _landmarks_come(self) -> bool:
+    def _landmarks_come(self, patience_s: float) -> bool:
         with self._timed("mapping"):
-            return self._take_updates(PATIENCE_S)
+            return self._take_updates(max(patience_s, 0.0))
 
     def _take_updates(self, patience_s: float = 0.0) -> bool:
         """Whether there were any."""
