@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from thegra_core.cli.main import app
 from thegra_core.evaluation.benchmark import realtime
 from thegra_core.evaluation.benchmark.slam import Plan, PlannedRun, RunResult, command, figures_of, planned_runs
+from thegra_core.evaluation.suite import SUITE
 
 MS = {"p50": 20.0, "p95": 40.0, "p99": 60.0}
 FIGURES = {
@@ -84,6 +85,14 @@ def test_the_simulated_walk_in_each_size_and_rate(tmp_path: Path) -> None:
     assert [len((path / "images.txt").read_text().splitlines()) for path in made] == [2, 4, 2, 4]
     assert len(told) == 16
     assert realtime.simulated(tmp_path, [(64, 48)], [2.0], 1.0, lambda *news: told.append(news)) == made[:1] and len(told) == 16, "what is there is kept"
+
+
+def test_the_suite_as_another_camera_would_see_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    short = {name: options.model_copy(update={"duration_s": 1.0}) for name, options in SUITE.items() if name in ("street_robust", "tunnel_unstable")}
+    monkeypatch.setattr(realtime, "SUITE", short)
+    made = realtime.simulated_suite(tmp_path, [(64, 48)], [3.0], lambda *_: None)
+    assert [path.name for path in made] == ["street_robust_64x48_3hz", "tunnel_unstable_64x48_3hz"]
+    assert [len((path / "images.txt").read_text().splitlines()) for path in made] == [3, 3]
 
 
 def test_wrong_sizes_are_told() -> None:

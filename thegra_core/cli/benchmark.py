@@ -92,9 +92,10 @@ def slam(
 def realtime(
     recordings: Annotated[list[Path] | None, typer.Argument(metavar="[DIR...]", help="Recordings as `thegra run` takes them. Default: a simulated room, in every --size at every --rate.")] = None,
     profile: Annotated[list[str] | None, typer.Option(help="paper, quality, fast or realtime; repeatable. Default: all.")] = None,
+    suite: Annotated[bool, typer.Option("--suite", help="Instead of the room: the simulated suite, by default at 640x512 and 20 Hz.")] = False,
     size: Annotated[list[str] | None, typer.Option(metavar="WxH", help="Of the simulated images; repeatable. Default: 320x256 and 640x512.")] = None,
     rate: Annotated[list[float] | None, typer.Option(metavar="HZ", min=0.1, help="Of the simulated images; repeatable. Default: 10, 20 and 30.")] = None,
-    duration: Annotated[float, typer.Option(metavar="S", min=1.0, help="Of the simulated recordings.")] = 20.0,
+    duration: Annotated[float, typer.Option(metavar="S", min=1.0, help="Of the simulated room.")] = 20.0,
     recordings_dir: Annotated[Path, typer.Option(metavar="DIR", help="Where the simulated recordings are kept.")] = Path("runs/realtime"),
     offline: Annotated[bool, typer.Option("--offline/--no-offline", help="Also run each without haste, for the accuracy that haste may cost.")] = True,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the tables and every run's results. Default: runs/benchmark_TIME.")] = None,
@@ -114,8 +115,15 @@ def realtime(
 
     target = out or Path("runs") / f"benchmark_{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}"
     with Console(stderr=True).status("starting") as status:
-        sizes = [image_size(text) for text in size or ("320x256", "640x512")]
-        played = recordings or logic.simulated(recordings_dir, sizes, rate or (10.0, 20.0, 30.0), duration, lambda n, done, total: status.update(f"simulating {n}: {done} of {total} frames"))
+        def say(name: str, done: int, total: int) -> None:
+            status.update(f"simulating {name}: {done} of {total} frames")
+
+        sizes = [image_size(text) for text in size or (("640x512",) if suite else ("320x256", "640x512"))]
+        played = list(recordings or ())
+        if suite:
+            played += logic.simulated_suite(recordings_dir, sizes, rate or (20.0,), say)
+        elif not played:
+            played = logic.simulated(recordings_dir, sizes, rate or (10.0, 20.0, 30.0), duration, say)
         content = logic.benchmark(played, tuple(dict.fromkeys(profile or PROFILES)), target, offline, tuple(set_ or ()), status.update)
     print(json.dumps(content, indent=2, allow_nan=False) if as_json else logic.markdown(content))
     for failure in logic.failures(content):

@@ -8,7 +8,7 @@ from typing import Any
 
 from thegra_core.evaluation.benchmark.machine import described, machine
 from thegra_core.evaluation.benchmark.slam import Plan, PlannedRun, RunResult, execute, planned_runs, write_report
-from thegra_core.evaluation.suite import make_recording
+from thegra_core.evaluation.suite import SUITE, make_recording
 from thegra_core.simulation.simulate import SimulationOptions
 from thegra_core.version import VERSION
 
@@ -35,6 +35,20 @@ def simulated(folder: Path, sizes: Sequence[tuple[int, int]], rates: Sequence[fl
             )
             made.append(make_recording(folder / f"room_{width}x{height}_{rate:g}hz_{duration_s:g}s", options, say))
     return made
+
+
+def simulated_suite(folder: Path, sizes: Sequence[tuple[int, int]], rates: Sequence[float], say: Callable[[str, int, int], None]) -> list[Path]:
+    """The sequences of the suite as other cameras would have seen them: in each size (width, height) px at each rate (Hz); what is missing is simulated.
+
+    Raises:
+        InputError: As `make_recording`.
+    """
+    return [
+        make_recording(folder / f"{name}_{size[0]}x{size[1]}_{rate:g}hz", options.model_copy(update={"image_size": size, "rate_hz": rate}), say)
+        for size in sizes
+        for rate in rates
+        for name, options in SUITE.items()
+    ]
 
 
 def benchmark(
