@@ -19,7 +19,7 @@ from thegra_core.features.tracks import TrackMatcher
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.process import MappingProcess
 from thegra_core.mapping.service import MOST_LEFT, InlineMapping
-from thegra_core.messages import Features, Keyframe, MapUpdate, Run, TrackingResult, TrackingState
+from thegra_core.messages import NO_LANDMARK, Features, Keyframe, MapUpdate, Run, TrackingResult, TrackingState
 from thegra_core.slam import Slam
 
 FOLLOWING = CONFIG.model_copy(update={"flow": FlowConfig(enabled=True)})
@@ -205,28 +205,65 @@ def test_a_process_of_its_own_maps_as_well(beside: Slam) -> None:
 
 
 def test_new_landmarks_come_before_they_are_adjusted(beside: Slam) -> None:
-    """A keyframe is answered twice: by what is new, and by where everything is after the adjustment."""
+    """A keyframe is answered three times: by the landmarks of its known matches, by those of others, and by where everything is after the adjustment."""
     updates, taken = beside._mapping.updates, []
 
-    def recorded() -> list[MapUpdate]:
-        got = updates()
+    def recorded(patience_s: float = 0.0) -> list[MapUpdate]:
+        got = updates(patience_s)
         taken.extend(got)
         return got
 
     beside._mapping.updates = recorded  # type: ignore[method-assign]
     process_all(beside, 40)
     beside._take_updates()
-    grown = [u for u in taken if u.new_keyframes][1:]
-    settled = [u for u in taken if not u.new_keyframes]
-    assert len(grown) == len(settled) > 3
-    for first, second in zip(grown, settled, strict=True):
-        assert second.version == first.version + 1
+    answers = taken[1:]  # the first map comes before
+    assert len(answers) > 9 and len(answers) % 3 == 0
+    for first, second, third in zip(*[iter(answers)] * 3, strict=True):
+        assert [len(u.new_keyframes) for u in (first, second, third)] == [1, 0, 0]
+        assert [u.version - first.version for u in (second, third)] == [1, 2]
         assert first.landmarks is not None and len(first.landmarks.ids) > 0
-        assert {k.id for k in first.new_keyframes} <= {k.id for k in second.keyframes}
+        assert first.new_keyframes[0].id in {k.id for k in third.keyframes}
     (own,), known = beside._mapping.maps(), beside._tracking.map
     assert known is not None and known.keyframes.keys() == own.keyframes.keys()
     for i, keyframe in own.keyframes.items():
         np.testing.assert_array_equal(known.keyframes[i].world_from_camera, keyframe.world_from_camera)
+
+
+class Hesitant(InlineMapping):
+    """Answers a keyframe step by step, one step each time that it is waited for."""
+
+    def __init__(self) -> None:
+        super().__init__(Mapper(CAMERA, FOLLOWING, fake_matcher(FOLLOWING)))
+        self.hesitates = False
+        self.waited_for = 0
+        self._steps: list[MapUpdate] = []
+
+    def insert(self, keyframe: Keyframe) -> None:
+        self._steps += self.insert_by_steps(keyframe, lambda: False)
+
+    def updates(self, patience_s: float = 0.0) -> list[MapUpdate]:
+        if not self.hesitates:
+            self._updates, self._steps = [*self._updates, *self._steps], []
+        elif patience_s > 0 and self._steps:
+            self.waited_for += 1
+            self._updates.append(self._steps.pop(0))
+        return super().updates()
+
+
+def test_a_frame_that_sees_no_landmarks_waits_for_those_of_the_last_keyframe() -> None:
+    slam, end, _ = make(WALK)
+    slam._mapping = mapping = Hesitant()
+    play(slam, 25)
+    mapping.hesitates = True
+    i = next(i for i in range(25, 45) if play(slam, 1, i)[0].is_keyframe)
+    slam._tracking._place.tracks._landmarks[:] = NO_LANDMARK  # type: ignore[union-attr]
+    asked = len(end.asked)
+    result = play(slam, 1, i + 1)[0]
+    assert result.state is TrackingState.TRACKING and mapping.waited_for == 1
+    assert len(end.asked) == asked, "nothing had to be detected"
+    slam._tracking._place.tracks._landmarks[:] = NO_LANDMARK  # type: ignore[union-attr]
+    assert play(slam, 1, i + 2)[0].state is TrackingState.TRACKING and mapping.waited_for == 1, "its keyframe has been answered"
+    assert len(end.asked) > asked
 
 
 class Scripted(InlineMapping):
@@ -301,7 +338,7 @@ def test_a_map_that_took_its_time_is_caught_up_with() -> None:
 def test_tracking_goes_on_while_mapping_is_behind(beside: Slam) -> None:
     process_all(beside, 25)
     held_back = beside._mapping.updates
-    beside._mapping.updates = list  # type: ignore[method-assign]
+    beside._mapping.updates = lambda patience_s=0.0: []  # type: ignore[method-assign]
     results = play(beside, 20, 25)
     assert all(r.state is TrackingState.TRACKING for r in results)
     assert sum(r.is_keyframe for r in results) == FOLLOWING.keyframe.most_pending
