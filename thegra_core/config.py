@@ -258,6 +258,7 @@ class TrackingConfig(Section):
     min_reference_matches: int = Field(15, ge=4, description="matches that see a landmark; ORB-SLAM3: 15")
     min_reference_inliers: int = Field(10, ge=4, description="ORB-SLAM3: 10")
     min_inliers: int = Field(25, ge=6, description="inliers after the second stage; ORB-SLAM3: 30, thermal frames have fewer points")
+    min_visible_share: float = Field(0.15, ge=0, le=1, description="landmarks that agree over those that should be seen from there, of the keyframe that shares most with a frame; where the view jumps to another street 0.11 agree, where tracking goes on 0.25 to 0.8 (measured)")
     min_sparse_landmarks: int = Field(8, ge=4, description="landmarks that suffice where matches without landmarks agree with the pose: they give what those leave open, the scale")
     min_sparse_matches: int = Field(50, ge=10, description="matches without landmarks, and at least half of all, that must agree with such a pose")
     local_keyframes: int = Field(20, ge=1, description="keyframes whose landmarks are projected")

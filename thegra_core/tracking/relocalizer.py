@@ -24,8 +24,8 @@ def relocalize(
     """Place the frame by its matches to all candidate keyframes together; also the keyframe that shares most with it and the matches to that one.
 
     One keyframe alone may share too little with a frame that comes back after a gap; what several share adds up. `known` matches are not made again.
-    nearby: the camera was at these keyframes just now, and a pose that tracking would take will do. A camera that may be anywhere sees much that looks alike,
-    such as the cars and windows of another street: see `doubt_of`.
+    nearby: the camera was at these keyframes just now, and a pose that tracking would take will do, see `doubt_nearby`. A camera that may be anywhere sees much
+    that looks alike, such as the cars and windows of another street: see `doubt_of`.
     """
     matched = dict(known or {})
     open_ids = [i for i in candidates if i not in matched]
@@ -37,7 +37,7 @@ def relocalize(
     if isinstance(found, str):
         return None
     reference_id = best_reference(current, found.landmark_ids, list(matched))
-    doubt = "" if nearby else doubt_of(current, found, reference_id, config)
+    doubt = (doubt_nearby if nearby else doubt_of)(current, found, reference_id, config)
     if doubt:
         logger.info("the frame at %.3f s looks like keyframe %d: %s", features.stamp_ns / 1e9, reference_id, doubt)
         return None
@@ -47,10 +47,20 @@ def relocalize(
 def doubt_of(current: Map, found: Localization, reference_id: int, config: ThegraConfig) -> str:
     """Why a pose of a camera that may be anywhere is not believed, by the keyframe that shares most with it; empty if it is."""
     settings = config.relocalization
-    agreeing, visible = evidence(current, found, reference_id, config)
     if found.inliers < settings.min_inliers:
         return f"{found.inliers} landmarks agree with one pose"
-    return f"{agreeing} landmarks agree with one pose, {visible} should be seen from there" if agreeing < settings.min_visible_share * visible else ""
+    return _too_few_of(*evidence(current, found, reference_id, config), settings.min_visible_share)
+
+
+def doubt_nearby(current: Map, found: Localization, reference_id: int, config: ThegraConfig) -> str:
+    """As `doubt_of`, for a camera that was there just now: the view may all the same have jumped to a place that looks alike. What few landmarks and many other
+    matches have placed (`localize_sparsely`) has had a proof of its own."""
+    settings = config.tracking
+    return "" if found.inliers < settings.min_inliers else _too_few_of(*evidence(current, found, reference_id, config), settings.min_visible_share)
+
+
+def _too_few_of(agreeing: int, visible: int, share: float) -> str:
+    return f"{agreeing} landmarks agree with one pose, {visible} should be seen from there" if agreeing < share * visible else ""
 
 
 def evidence(current: Map, found: Localization, reference_id: int, config: ThegraConfig) -> tuple[int, int]:

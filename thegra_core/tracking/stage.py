@@ -33,7 +33,7 @@ from thegra_core.tracking.followed import NotPlaced, localize_followed
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import needs_keyframe
 from thegra_core.tracking.place import Place
-from thegra_core.tracking.relocalizer import doubt_of, evidence, last_keyframes, nearest_in_time, relocalize, similar_keyframes
+from thegra_core.tracking.relocalizer import doubt_nearby, doubt_of, evidence, last_keyframes, nearest_in_time, relocalize, similar_keyframes
 from thegra_core.tracking.tracker import FrameView, Localization, best_reference, localize
 from thegra_core.tracking.turning import FoundTurned, Turned, turn_back
 
@@ -141,8 +141,8 @@ class TrackingStage:
         if matches is None or matches.reference_stamp_ns != place.reference.stamp_ns:
             matches = self._matcher.match(features, place.reference)
         found = localize(place.map, features, place.reference_id, {place.reference_id: matches}, place.predict(features.stamp_ns), self._config)
-        if place.lost_frames and not isinstance(found, str):
-            found = doubt_of(place.map, found, place.reference_id, self._config) or found
+        if not isinstance(found, str):
+            found = (doubt_of if place.lost_frames else doubt_nearby)(place.map, found, place.reference_id, self._config) or found
         if isinstance(found, str):
             return self._recover(place, features, matches, found, turned)
         if self._may_turn_back(place, found) and turned is not None:
