@@ -13,6 +13,7 @@ import numpy as np
 from thegra_core.geometry.camera import CameraModel, DistortionModel
 from thegra_core.geometry.poses import so3_exp
 from thegra_core.messages import Frame, FrameRecord, MapSummary, Run, Snapshot, TrackingResult, TrackingState
+from thegra_core.preprocessing.stage import Prepared
 from thegra_core.process import Usage
 
 PERIOD_NS = 100_000_000
@@ -116,9 +117,12 @@ class FakeSystem:
     def close(self) -> None:
         self.closed = True
 
-    def process(self, frame: Frame) -> TrackingResult:
+    def prepare(self, frame: Frame) -> Prepared:
+        return Prepared(frame)
+
+    def track(self, prepared: Prepared) -> TrackingResult:
         self.processed += 1
-        return self._run.frames[frame.index].result
+        return self._run.frames[prepared.frame.index].result
 
     def snapshot(self) -> Snapshot | None:
         return self._run.snapshots[0]

@@ -215,8 +215,8 @@ def test_the_wanted_part_is_processed(play, options: list[str], indices: list[in
     run = make_run("t" * 20)
     system = FakeSystem(run)
     seen: list[int] = []
-    process = system.process
-    system.process = lambda frame: seen.append(frame.index) or process(frame)  # type: ignore[method-assign]
+    track = system.track
+    system.track = lambda prepared: seen.append(prepared.frame.index) or track(prepared)  # type: ignore[method-assign]
     result, out = play(run, *options, system=system)
     assert result.exit_code == 0
     assert seen == indices
@@ -277,10 +277,10 @@ def test_interrupted_source_leaves_what_is_there(play, tmp_path: Path, frames: i
 
 def test_ctrl_c_lets_the_frame_end(play) -> None:
     class Pressed(FakeSystem):
-        def process(self, frame):
-            if frame.index == 6:
+        def track(self, prepared):
+            if prepared.frame.index == 6:
                 signal.raise_signal(signal.SIGINT)
-            return super().process(frame)
+            return super().track(prepared)
 
     run, before = make_run("t" * 20), signal.getsignal(signal.SIGINT)
     result, out = play(run, system=Pressed(run))
