@@ -231,6 +231,7 @@ class MapUpdate:
     `new_keyframes` carry their features; `keyframes` restate pose and landmark ids of each keyframe that changed (the new ones too);
     `landmarks` restate each landmark that is new or changed; `absorbed` names a map that this one has taken in, and the update then holds all of the map;
     `scales` tells by what factor the surroundings of keyframes grew, where a loop changed their scale; heirs of removed keyframes grow after they inherited.
+    `adjusted_id` is the keyframe around which the map has been adjusted, -1 if around none.
     """
 
     version: int
@@ -244,6 +245,7 @@ class MapUpdate:
     absorbed: Absorbed | None = None
     scales: Mapping[int, float] = field(default_factory=dict)
     revisits: tuple[Revisit, ...] = ()
+    adjusted_id: int = -1
 
 
 @dataclass(frozen=True, slots=True)

@@ -130,7 +130,9 @@ class Slam:
         """Let everything that is made at its first use be made, and wait for the process of mapping: a live stream waits for nothing."""
         width, height = self._camera.image_size
         noise = np.random.default_rng(0).integers(0, 255, (height, width), np.uint8)
-        features = self._extractor.extract(noise, 0)
+        self._front_end.follow(self._preprocessing.warm_up(noise), 0)
+        features = self._front_end.detect()
+        self._front_end.forget()
         for matcher in filter(None, (self._matcher, self._thorough)):
             matcher.match(features, features)
         self._mapping.usage()

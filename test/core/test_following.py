@@ -266,6 +266,25 @@ def test_a_frame_that_sees_no_landmarks_waits_for_those_of_the_last_keyframe() -
     assert len(end.asked) > asked
 
 
+def test_nothing_hangs_on_the_keyframe_of_a_camera_that_was_found_again_before_it_is_adjusted() -> None:
+    slam, _, _ = make(WALK)
+    slam._mapping = mapping = Hesitant()
+    play(slam, 25)
+    place = slam._tracking._place
+    assert place is not None
+    mapping.hesitates = True
+    for i in range(25, 35):
+        place.lost_frames = 1
+        found = play(slam, 1, i)[0]
+        if found.is_keyframe:
+            break
+    assert found.state is TrackingState.TRACKING and found.is_keyframe
+    results = play(slam, 12, i + 1)
+    assert all(r.state is TrackingState.TRACKING and not r.is_keyframe for r in results)
+    mapping.hesitates = False
+    assert any(r.is_keyframe for r in play(slam, 3, i + 13)), "and then it goes on"
+
+
 class Scripted(InlineMapping):
     """Mapping in which others wait after the steps told."""
 

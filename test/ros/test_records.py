@@ -103,7 +103,7 @@ def test_updates_of_loops_are_exact() -> None:
     update = MapUpdate(
         7, 2, removed_keyframes=(RemovedKeyframe(3, 2**60 + 1, 4, np.random.default_rng(1).normal(size=(4, 4))),), removed_landmark_ids=np.array([1, 9], np.int64), covisibility={4: ((1, 20), (2, 17)), 6: ()},
         absorbed=Absorbed(5, np.random.default_rng(0).normal(size=(4, 4)), 1.7), scales={4: 1.25, 6: 0.1},
-        revisits=(Revisit(2**60 + 3, 2, 8, 4, 77, 0.1, 1.0 / 3), Revisit(5, 2, 9, 4, 50, 0.0, 0.7, 5)),
+        revisits=(Revisit(2**60 + 3, 2, 8, 4, 77, 0.1, 1.0 / 3), Revisit(5, 2, 9, 4, 50, 0.0, 0.7, 5)), adjusted_id=6,
     )  # fmt: skip
     assert same(tables_update(send(update_tables(update))), update)
 

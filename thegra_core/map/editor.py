@@ -39,6 +39,7 @@ class MapEditor:
         self._removed: set[int] = set()
         self._removed_keyframes: dict[int, RemovedKeyframe] = {}
         self._revisits: list[Revisit] = []
+        self.adjusted_id = -1
         self._edges: set[int] = set()
         self._scales: dict[int, float] = {}
 
@@ -341,7 +342,9 @@ class MapEditor:
             absorbed=absorbed,
             scales=dict(self._scales),
             revisits=tuple(self._revisits),
+            adjusted_id=self.adjusted_id,
         )
+        self.adjusted_id = -1
         self._new, self._scales, self._removed_keyframes, self._revisits = [], {}, {}, []
         for changed in (self._keyframes, self._landmarks, self._removed, self._edges):
             changed.clear()

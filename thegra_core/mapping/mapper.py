@@ -114,6 +114,7 @@ class Mapper:
         editor = self._editors[keyframe.map_id]
         self._full.collect(editor)
         adjust_locally(editor, keyframe.id, self._config)
+        editor.adjusted_id = keyframe.id
         editor.connect(keyframe.id)
 
     def _tie(self, keyframe: Keyframe) -> MapUpdate | None:

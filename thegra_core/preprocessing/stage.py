@@ -50,6 +50,12 @@ class PreprocessingStage:
         self._last_stamp_ns: int | None = None
         self._backward, self._backward_ns = 0, None  # type: int, int | None
 
+    def warm_up(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The filters' result for an image that is not of the stream: what is compiled at its first use has been compiled then."""
+        result = self._chain(image, 0)
+        self._chain.reset()
+        return result
+
     def process(self, frame: Frame) -> Prepared:
         """Look for the shutter, and filter what the camera sees; never raises for what an image holds.
 

@@ -23,7 +23,8 @@ class Place:
 
     resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet, and
     their poses. awaited_since_ns: stamp after which frames came while mapping made the map, until they have been looked at. turns: quarter turns
-    counter-clockwise by which images are turned before features are looked for in them, so that they lie as the map's first one does.
+    counter-clockwise by which images are turned before features are looked for in them, so that they lie as the map's first one does. unadjusted_id: the
+    keyframe by which the camera was found again, until the map has been adjusted around it; -1 if there is none.
     """
 
     map: Map
@@ -41,6 +42,7 @@ class Place:
     pending: dict[int, FloatArray] = field(default_factory=dict)
     awaited_since_ns: int | None = None
     turns: int = 0
+    unadjusted_id: int = -1
 
     @property
     def begun(self) -> bool:
@@ -57,6 +59,8 @@ class Place:
 
     def take(self, update: MapUpdate) -> None:
         self.map.apply(update)
+        if update.adjusted_id >= self.unadjusted_id:
+            self.unadjusted_id = -1
         for removed in update.removed_keyframes:
             self.places.remove(removed.id)
         for message in update.new_keyframes:

@@ -243,7 +243,7 @@ class TrackingStage:
         place.motion.move(Similarity(absorbed.rigid, absorbed.scale))
         place.reference_id = place.last_keyframe_id = newest = max(m.id for m in update.new_keyframes)
         place.tracks.replace(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
-        place.probation, self._before = 0, None
+        place.probation, self._before, place.unadjusted_id = 0, None, -1
         place.visible, place.found, place.pending = [], [], {}
 
     def relative_to_reference(self, result: TrackingResult) -> tuple[int, FloatArray]:
@@ -326,7 +326,8 @@ class TrackingStage:
         )  # fmt: skip
         return self._claim(place, features, TrackingOutput(result, initial_map=initial, landmark_ids=last.landmark_ids, matches=last.reference_matches))
 
-    def _accept(self, place: Place, features: Features, found: Localization, matches: Matches) -> TrackingOutput:
+    def _accept(self, place: Place, features: Features, found: Localization, matches: Matches, sought: bool = False) -> TrackingOutput:
+        sought = sought or place.lost_frames > 0
         if place.lost_frames:
             told = "found again at %.3f s in map %d after %d frames: %d landmarks of the most similar keyframe agree, %d should be seen from there"
             logger.info(told, features.stamp_ns / 1e9, place.map.map_id, place.lost_frames, *evidence(place.map, found, place.reference_id, self._config))
@@ -338,6 +339,8 @@ class TrackingStage:
         place.tracks.replace(features, found.landmark_ids)
         matched_to = place.reference_id
         keyframe = self._as_keyframe(place, features, found, matches)
+        if keyframe is not None and sought:
+            place.unadjusted_id = keyframe.id
         if keyframe is None:
             local = place.map.local_keyframes(place.reference_id, self._config.tracking.local_keyframes)
             alike = [i for i in local if lie_alike(place.map.keyframes[i], found.world_from_camera, features.turns)]
@@ -403,8 +406,8 @@ class TrackingStage:
         return replace(self._accept(place, found.features, found.localization, found.matches), found_turned=found.features)
 
     def _keyframe_due(self, place: Place, found: Localization) -> bool:
-        if self.localization_only or len(place.pending) >= self._config.keyframe.most_pending:
-            return False
+        if self.localization_only or len(place.pending) >= self._config.keyframe.most_pending or place.unadjusted_id >= 0:
+            return False  # what hangs on a keyframe that was placed by little would bend the map before that can be set right
         reference = place.map.keyframes[place.reference_id]
         tracked_ratio = found.inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
         depth = place.map.median_depth(place.reference_id, found.world_from_camera)
@@ -420,7 +423,7 @@ class TrackingStage:
         found = self._seek(place, features, matches)
         if found is not None:
             place.reference_id = found[1]
-            return self._accept(place, features, found[0], found[2])
+            return self._accept(place, features, found[0], found[2], sought=True)
         rotations = self._config.loop.rotations if turned is not None and place.lost_frames < self._config.relocalization.new_map_after_frames else ()
         for degrees in rotations:
             assert turned is not None

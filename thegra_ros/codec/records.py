@@ -151,7 +151,7 @@ def tables_initial_map(tables: list[Table]) -> InitialMap:
 
 def update_tables(update: MapUpdate) -> list[Table]:
     """Poses and landmark ids of changed keyframes, landmarks, what was removed, who sees the same, and new keyframes."""
-    facts = {"update": str(update.version), "map": str(update.map_id), "revisits": json.dumps([asdict(revisit) for revisit in update.revisits])}
+    facts = {"update": str(update.version), "map": str(update.map_id), "revisits": json.dumps([asdict(revisit) for revisit in update.revisits]), "adjusted": str(update.adjusted_id)}
     if update.absorbed is not None:
         facts["absorbed"] = str(update.absorbed.map_id)
         facts["old_from_absorbed"] = " ".join(repr(x) for x in [*update.absorbed.rigid.ravel().tolist(), update.absorbed.scale])
@@ -184,6 +184,7 @@ def tables_update(tables: list[Table]) -> MapUpdate:
         absorbed=_absorbed(facts),
         scales=dict(zip(_ids(scales, "id").tolist(), scales.columns["scale"].tolist(), strict=True)),
         revisits=tuple(Revisit(**revisit) for revisit in json.loads(facts["revisits"])),
+        adjusted_id=int(facts["adjusted"]),
     )
 
 
