@@ -203,15 +203,15 @@ def _play(
     """As `_process`, at the recording's own rate; frames that come too fast are dropped."""
     latency_ms: list[float] = []
     with Playback(frames) as playback:
-        prepared = read_ahead(map(system.prepare, playback), 1)
-        done, wall_s = _process(system, prepared, recording, progress, viewer, interrupted, lambda frame: latency_ms.append(playback.latency_ms(frame)))
+        prepared = map(system.prepare, playback)  # not ahead: what waits may be dropped
+        done, wall_s = _process(system, prepared, recording, progress, viewer, interrupted, lambda: latency_ms.append(playback.latency_ms()))
     done.dropped, done.latency_ms = playback.dropped, latency_ms
     return done, wall_s
 
 
 def _process(
     system: System, frames: Iterator[Prepared], recording: Recording, progress: Progress, viewer: Viewer, interrupted: Callable[[], bool],
-    processed: Callable[[Frame], None] = lambda _: None,
+    processed: Callable[[], None] = lambda: None,
 ) -> tuple[_Done, float]:
     """All frames through the system, `processed` called after each; returns also the seconds it took."""
     done, news, before = _Done(), News(), dict(recording.problems)
@@ -219,7 +219,7 @@ def _process(
     try:
         for prepared in frames:
             frame, result = prepared.frame, system.track(prepared)
-            processed(frame)
+            processed()
             done.frames += 1
             done.reason = result.reason or done.reason
             if news.is_new(result):

@@ -35,7 +35,7 @@ class Playback:
         self._stopped = threading.Event()
         self._ended = False
         self._error: BaseException | None = None
-        self._due_s: dict[int, float] = {}
+        self._due_s = 0.0
         self._thread = threading.Thread(target=self._play, name="thegra playback", daemon=True)
 
     def __enter__(self) -> Playback:
@@ -56,13 +56,12 @@ class Playback:
                     if self._error is not None:
                         raise self._error
                     return
-                frame, due_s = self._queue.popleft()
-            self._due_s[frame.index] = due_s
+                frame, self._due_s = self._queue.popleft()
             yield frame
 
-    def latency_ms(self, frame: Frame) -> float:
-        """Milliseconds since a frame that was given was delivered; to be asked once."""
-        return 1e3 * (self._clock() - self._due_s.pop(frame.index))
+    def latency_ms(self) -> float:
+        """Milliseconds since the frame given last was delivered."""
+        return 1e3 * (self._clock() - self._due_s)
 
     def _play(self) -> None:
         try:
