@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Path
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
@@ -24,7 +25,7 @@ from thegra_core.messages import Frame, TrackingState
 from thegra_ros.benchmark.processes import NAMESPACE, running
 from thegra_ros.codec.images import camera_info_message, image_message
 from thegra_ros.codec.stamps import header, stamp_ns
-from thegra_ros.qos import RELIABLE
+from thegra_ros.qos import LATCHED, RELIABLE
 
 GRAPHS = {"one process": ("slam",), "four processes": ("preprocessing", "frontend", "tracking", "mapping")}
 TARGETS_MS = {"one process": 5.0, "four processes": 12.0}
@@ -36,7 +37,7 @@ DISCOVERY_LIMIT_S, SETTLE_S, LAST_POSE_S = 60.0, 2.0, 5.0
 class Overhead:
     """Milliseconds from image to pose by way of ROS, directly, and their difference frame by frame; over frames that did not wait for the one before.
 
-    Keyframes, by the direct call, are told apart: frame by frame the same ones need not become keyframes again.
+    Keyframes take twice as long, and the same frames need not become keyframes again: those that are by both ways are told apart, those by one are left out.
     """
 
     graph: str
@@ -63,7 +64,7 @@ def benchmark(frames: Sequence[Frame], camera: CameraModel, config: ThegraConfig
     found = []
     for graph, nodes in GRAPHS.items():
         say(graph)
-        found.append(compare(graph, alone, camera_to_pose(frames, camera, config, nodes, rate_hz)))
+        found.append(compare(graph, alone, *camera_to_pose(frames, camera, config, nodes, rate_hz)))
     width, height = camera.image_size
     return {"image_size": [width, height], "frames": len(frames), "rate_hz": rate_hz, "extractor": config.extractor.name, "graphs": [asdict(item) for item in found]}
 
@@ -76,18 +77,18 @@ class Alone:
     is_keyframe: bool
 
 
-def compare(graph: str, alone: dict[int, Alone], by_ros: dict[int, float]) -> Overhead:
+def compare(graph: str, alone: dict[int, Alone], by_ros: dict[int, float], keyframes_by_ros: Set[int]) -> Overhead:
     """Both times of the frames that have both.
 
     Raises:
         InputError: If there is none but keyframes.
     """
     both = sorted(set(alone) & set(by_ros))
-    plain = [stamp for stamp in both if not alone[stamp].is_keyframe]
+    plain = [stamp for stamp in both if not alone[stamp].is_keyframe and stamp not in keyframes_by_ros]
     if not plain:
         raise InputError(f"{graph}: no frame but keyframes has a pose that did not wait for the frame before; a lower --rate helps")
-    difference = {stamp: by_ros[stamp] - alone[stamp].ms for stamp in both}
-    of_plain, of_keyframes = ([d for stamp, d in difference.items() if alone[stamp].is_keyframe is kind] for kind in (False, True))
+    shared = [stamp for stamp in both if alone[stamp].is_keyframe and stamp in keyframes_by_ros]
+    of_plain, of_keyframes = ([by_ros[stamp] - alone[stamp].ms for stamp in stamps] for stamps in (plain, shared))
     return Overhead(
         graph, len(plain), _median([alone[s].ms for s in plain]), _median([by_ros[s] for s in plain]), _median(of_plain),
         round(float(np.percentile(of_plain, 95)), 2), len(of_keyframes), _median(of_keyframes) if of_keyframes else None, TARGETS_MS[graph],
@@ -111,8 +112,8 @@ def direct(frames: Sequence[Frame], camera: CameraModel, config: ThegraConfig, r
     return taken
 
 
-def camera_to_pose(frames: Sequence[Frame], camera: CameraModel, config: ThegraConfig, nodes: Sequence[str], rate_hz: float) -> dict[int, float]:
-    """Milliseconds from an image in the camera's process to its pose there, by stamp, of frames that did not find the one before still in work."""
+def camera_to_pose(frames: Sequence[Frame], camera: CameraModel, config: ThegraConfig, nodes: Sequence[str], rate_hz: float) -> tuple[dict[int, float], Set[int]]:
+    """Milliseconds from an image in the camera's process to its pose there, by stamp, of frames that did not find the one before still in work; and the stamps of keyframes."""
     sent: dict[int, float] = {}
     with running(nodes, config), _camera() as driver:
         driver.wait_for(BETWEEN_STAGES if len(nodes) > 1 else ())
@@ -124,8 +125,8 @@ def camera_to_pose(frames: Sequence[Frame], camera: CameraModel, config: ThegraC
         end = time.monotonic() + LAST_POSE_S
         while frames[-1].stamp_ns not in driver.received and time.monotonic() < end:
             time.sleep(0.1)
-        received = dict(driver.received)
-    return unhindered(sent, received)
+        received, keyframes = dict(driver.received), frozenset(driver.keyframes)
+    return unhindered(sent, received), keyframes
 
 
 def unhindered(sent: dict[int, float], received: dict[int, float]) -> dict[int, float]:
@@ -156,7 +157,9 @@ class _Driver(Node):
         self.images = self.create_publisher(Image, "image_raw", RELIABLE)
         self.infos = self.create_publisher(CameraInfo, "camera_info", RELIABLE)
         self.received: dict[int, float] = {}
+        self.keyframes: set[int] = set()
         self.create_subscription(PoseWithCovarianceStamped, "pose", self._on_pose, RELIABLE)
+        self.create_subscription(Path, "keyframe_path", self._on_keyframes, LATCHED)
 
     def wait_for(self, topics: Sequence[str]) -> None:
         """Wait until images are listened to, poses are published, and the stages have found each other.
@@ -173,6 +176,9 @@ class _Driver(Node):
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         self.received[stamp_ns(message)] = time.monotonic()
+
+    def _on_keyframes(self, message: Path) -> None:
+        self.keyframes.update(stamp_ns(pose) for pose in message.poses)
 
 
 @contextmanager
