@@ -129,13 +129,19 @@ def test_a_kidnapped_camera_relocalises_when_it_is_put_back() -> None:
     assert error < 0.005 and placed == 36
 
 
+def rooms_alike(share: float) -> tuple[World, World]:
+    """Two rooms of which a share of the points is the same."""
+    here = room(3000)
+    elsewhere = make_world(here.points, seed=99)
+    alike = np.random.default_rng(0).random(len(here.points)) < share
+    elsewhere.descriptors[alike] = here.descriptors[alike]
+    return here, elsewhere
+
+
 @pytest.mark.parametrize(("share", "found"), [(0.5, False), (0.0, True)])
 def test_a_view_that_jumps_to_something_alike_is_lost(share: float, found: bool) -> None:
     """As below, without a frame in between: tracking does not go on in the other room."""
-    here = room(3000)
-    elsewhere = make_world(here.points, seed=99)
-    alike = np.random.default_rng(0).random(len(here.points)) < 0.3
-    elsewhere.descriptors[alike] = here.descriptors[alike]
+    here, elsewhere = rooms_alike(0.3)
     config = CONFIG.model_copy(update={"tracking": CONFIG.tracking.model_copy(update={"min_visible_share": share})})
     path = loop(110)[:28]
     slam = make(here, path, config)
@@ -147,10 +153,7 @@ def test_a_view_that_jumps_to_something_alike_is_lost(share: float, found: bool)
 @pytest.mark.parametrize(("share", "found"), [(0.2, False), (0.0, True)])
 def test_a_place_that_only_has_something_alike_is_not_this_one(share: float, found: bool) -> None:
     """An eighth of the points is the same in both rooms, as the cars of two streets are: enough for a pose, not for a place."""
-    here = room(3000)
-    elsewhere = make_world(here.points, seed=99)
-    alike = np.random.default_rng(0).random(len(here.points)) < 0.125
-    elsewhere.descriptors[alike] = here.descriptors[alike]
+    here, elsewhere = rooms_alike(0.125)
     config = CONFIG.model_copy(update={"relocalization": CONFIG.relocalization.model_copy(update={"min_visible_share": share})})
     path = loop(110)[:25]
     slam = make(here, path, config)
