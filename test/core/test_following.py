@@ -295,10 +295,10 @@ class Scripted(InlineMapping):
         for name in ("grow", "settle", "tie"):
             setattr(self._mapper, name, self._noted(name, getattr(self._mapper, name)))
 
-    def _noted(self, name: str, step: Callable[[Keyframe], MapUpdate | None]) -> Callable[[Keyframe], MapUpdate | None]:
-        def noted(keyframe: Keyframe) -> MapUpdate | None:
+    def _noted(self, name: str, step: Callable[..., Any]) -> Callable[..., Any]:
+        def noted(keyframe: Keyframe, *others_wait: Callable[[], bool]) -> Any:
             self.steps.append(name)
-            return step(keyframe)
+            return step(keyframe)  # as if nobody waited while it grows: each answer of the script is that after a step
 
         return noted
 
@@ -352,6 +352,24 @@ def test_a_map_that_took_its_time_is_caught_up_with() -> None:
     assert slam.map_size()[0] > keyframes > 0, "keyframes from the time in between"
     assert all(r.state is TrackingState.TRACKING for r in play(slam, 15, begun + 12))
     assert slam.finish().losses == 0
+
+
+def test_a_keyframe_on_its_way_is_not_followed_by_another_because_few_landmarks_are_left() -> None:
+    """It brings landmarks; another one right after it would bring the same, and take as long."""
+    slam, _, _ = make(WALK, FOLLOWING.model_copy(update={"keyframe": FOLLOWING.keyframe.model_copy(update={"min_tracked_ratio": 0.99, "rotation_deg": 90.0, "translation_ratio": 9.0})}))
+    play(slam, 30)
+    slam._mapping.updates = lambda patience_s=0.0: []  # type: ignore[method-assign]
+    assert sum(r.is_keyframe for r in play(slam, 12, 30)) == 1
+
+
+def test_a_keyframe_that_is_due_by_the_followed_points_is_made() -> None:
+    """The image has been detected in for it; that more landmarks are found so does not make it needless, for they are not all followed."""
+    slam, end, _ = make(WALK)
+    play(slam, 25)
+    due, asked = iter([True]), []
+    slam._tracking._keyframe_due = lambda place, found: (asked.append(found), next(due, False))[1]  # type: ignore[method-assign]
+    assert [r.is_keyframe for r in play(slam, 3, 25)] == [True, False, False]
+    assert end.asked[-1] is Wanted.MORE and len(asked) == 3
 
 
 def test_tracking_goes_on_while_mapping_is_behind(beside: Slam) -> None:

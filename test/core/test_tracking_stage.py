@@ -52,6 +52,26 @@ def test_a_keyframe_in_halves_leads_to_the_same_poses(walk: Pair) -> None:
             np.testing.assert_allclose(other.result.world_from_camera, one.result.world_from_camera, atol=1e-6)
 
 
+def test_a_keyframe_is_matched_to_no_more_neighbours_once_others_wait() -> None:
+    pair = Pair()
+    matched: list[int] = []
+
+    def hurried(keyframe: Keyframe) -> MapUpdate:
+        before, answers = pair.matcher.calls, iter([False])
+        updates = list(pair.mapper.grow(keyframe, lambda: next(answers, True)))
+        matched.append(pair.matcher.calls - before)
+        assert len(updates) == 2, "it is in the map all the same"
+        for update in updates:
+            pair.tracking.apply(update)
+        return pair.mapper.settle(keyframe)
+
+    pair.mapper.insert = hurried  # type: ignore[method-assign]
+    path = sideways(60, 0.05)
+    pair.run(cloud(count=600, seed=1, low=(-4, -3, 3), high=(8, 3, 8)), path)
+    assert max(matched) == 1 < CONFIG.mapping.neighbours - 1
+    assert position_error(pair.outputs, path)[0] < 0.005
+
+
 def test_a_walk_is_tracked(walk: Pair) -> None:
     error, tracked = position_error(walk.outputs, sideways(60, 0.05))
     assert error < 0.005

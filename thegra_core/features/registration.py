@@ -44,12 +44,16 @@ def overlap_shift(before: Image, after: Image) -> Points:
 def follow_far(before: Image, after: Image, points: Points, near: Followed, config: FlowConfig) -> Followed:
     """Points (N, 2) px that were not found well (`near`) sought with more effort: after frames that are missing, a closed shutter, or a quick turn.
 
-    Of several shifts the one whose points agree best with one homography is taken, and then the first image is laid over the second by that: Lucas-Kanade
-    knows shifts only, and an image that is larger, turned or slanted looks alike once it is straightened.
+    Of two shifts, or none where neither leads anywhere, the one whose points agree best with one homography is taken, and then the first image is laid over the
+    second by that: Lucas-Kanade knows shifts only, and an image that is larger, turned or slanted looks alike once it is straightened.
     """
-    tried = [near, *(follow(before, after, points, points + shift, config) for shift in (np.zeros(2, np.float32), overlap_shift(before, after)))]
-    homographies = [_homography(points, result) for result in tried]
-    best, (homography, agreeing) = max(zip(tried, homographies, strict=True), key=lambda item: item[1][1])
+    tried = [(near, *_homography(points, near))]
+    for shift in (overlap_shift(before, after), np.zeros(2, np.float32)):
+        found = follow(before, after, points, points + shift, config)
+        tried.append((found, *_homography(points, found)))
+        if max(agreeing for _, _, agreeing in tried) > 0:
+            break
+    best, homography, agreeing = max(tried, key=lambda item: item[2])
     for _ in range(ROUNDS):
         if homography is None:
             break

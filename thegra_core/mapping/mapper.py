@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,10 @@ from thegra_core.messages import Absorbed, InitialMap, Keyframe, MapSummary, Map
 from thegra_core.optimization.solver import BundleSolver, InlineSolver
 
 logger = logging.getLogger(__name__)
+
+
+def _nobody_waits() -> bool:
+    return False
 
 
 class Mapper:
@@ -75,15 +80,15 @@ class Mapper:
 
     def insert(self, keyframe: Keyframe) -> MapUpdate:
         """Insert a keyframe: observations, culling, expansion with its neighbours, local bundle adjustment; then what it may tie together."""
-        deque(self._grow(keyframe), maxlen=0)
+        deque(self._grow(keyframe, _nobody_waits), maxlen=0)
         self._settle(keyframe)
         tied = self._tie(keyframe)
         return tied if tied is not None else self._editors[keyframe.map_id].take_update()
 
-    def grow(self, keyframe: Keyframe) -> Iterator[MapUpdate]:
+    def grow(self, keyframe: Keyframe, others_wait: Callable[[], bool] = _nobody_waits) -> Iterator[MapUpdate]:
         """The first step of `insert`, for a tracker that waits for the new landmarks, which are not adjusted yet: first those of the matches that it made itself,
-        then those of the matches that had to be made."""
-        for _ in self._grow(keyframe):
+        then those of the matches that had to be made, of which no more are made once others wait."""
+        for _ in self._grow(keyframe, others_wait):
             yield self._editors[keyframe.map_id].take_update()
 
     def settle(self, keyframe: Keyframe) -> MapUpdate:
@@ -97,13 +102,13 @@ class Mapper:
         tied = self._tie(keyframe)
         return self._editors[keyframe.map_id].take_update() if tied is None and self.loops != before else tied
 
-    def _grow(self, keyframe: Keyframe) -> Iterator[None]:
+    def _grow(self, keyframe: Keyframe, others_wait: Callable[[], bool]) -> Iterator[None]:
         """Stops where landmarks have come."""
         editor = self._editors[keyframe.map_id]
         editor.add_keyframe(keyframe)
         editor.connect(keyframe.id)
         self._cull(editor, keyframe)
-        yield from self._expand(editor, keyframe)
+        yield from self._expand(editor, keyframe, others_wait)
         editor.connect(keyframe.id)
         self._thin(editor, keyframe.id)
         self._loops[keyframe.map_id].index.add(keyframe.id, keyframe.features)
@@ -235,8 +240,11 @@ class Mapper:
             self._graphs[editor.map.map_id].remove(removed)
             self._loops[editor.map.map_id].index.remove(removed)
 
-    def _expand(self, editor: MapEditor, keyframe: Keyframe) -> Iterator[None]:
-        """Match the keyframe to its neighbours, the reference first, whose matches tracking already has, and through them to theirs; stops after the reference."""
+    def _expand(self, editor: MapEditor, keyframe: Keyframe, others_wait: Callable[[], bool]) -> Iterator[None]:
+        """Match the keyframe to its neighbours, the reference first, whose matches tracking already has, and through them to theirs; stops after the reference.
+
+        The neighbours are matched in the order of what they are worth, until others wait: a network takes as long for each as tracking for a frame.
+        """
         neighbours = self._choose_neighbours(editor, keyframe)
         graph, before, count = self._graphs[keyframe.map_id], editor.next_landmark, self._config.mapping.neighbours
         if keyframe.reference_matches is not None and keyframe.reference_id in editor.map.keyframes:
@@ -244,9 +252,7 @@ class Mapper:
             expand(editor, keyframe.id, keyframe.reference_id, keyframe.reference_matches, self._config.mapping)
             neighbours, count = [i for i in neighbours if i != keyframe.reference_id], count - 1
             yield
-        neighbours = neighbours[:count]
-        matched = self._matcher.match_many(keyframe.features, [editor.map.keyframes[i].features for i in neighbours])
-        known = list(zip(neighbours, matched, strict=True))
+        known = [(i, self._matcher.match(keyframe.features, editor.map.keyframes[i].features)) for i in takewhile(lambda _: not others_wait(), neighbours[:count])]
         for neighbour, matches in known:
             graph.add(keyframe.id, neighbour, matches)
         for other, matches in [*known, *graph.chained(keyframe.id, self._config.mapping.chained_keyframes)]:

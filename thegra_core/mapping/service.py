@@ -105,7 +105,7 @@ class InlineMapping:
         if keyframe.map_id not in self._mapper.map_ids:
             return
         self._left += 1
-        yield from self._mapper.grow(keyframe)
+        yield from self._mapper.grow(keyframe, others_wait)
         if self._left <= MOST_LEFT and others_wait():
             return
         yield self._mapper.settle(keyframe)

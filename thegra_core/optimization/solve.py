@@ -11,8 +11,8 @@ from contextlib import suppress
 from thegra_core.lifeline import end_with_parent
 from thegra_core.optimization.solver import BundleTask
 
-NICENESS = 10
-"""Tracking and local mapping go first where cores are few."""
+NICENESS = 19
+"""Tracking and local mapping go first where cores are few: a full adjustment is waited for by nobody."""
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ class Place:
     resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet, and
     their poses. awaited_since_ns: stamp after which frames came while mapping made the map, until they have been looked at. turns: quarter turns
     counter-clockwise by which images are turned before features are looked for in them, so that they lie as the map's first one does. unadjusted_id: the
-    keyframe by which the camera was found again, until the map has been adjusted around it; -1 if there is none.
+    keyframe by which the camera was found again, until the map has been adjusted around it; -1 if there is none. due: a keyframe is, by the points followed to the frame in work.
     """
 
     map: Map
@@ -43,6 +43,7 @@ class Place:
     awaited_since_ns: int | None = None
     turns: int = 0
     unadjusted_id: int = -1
+    due: bool = False
 
     @property
     def begun(self) -> bool:

@@ -173,7 +173,8 @@ class TrackingStage:
             logger.debug("followed keypoints at %.3f s: %s", features.stamp_ns / 1e9, found.reason)
             self.lacks_landmarks = bool(place.pending) and not found.misled
             return Wanted.ANEW if found.misled else Wanted.MORE
-        if self._keyframe_due(place, found):
+        place.due = self._keyframe_due(place, found)
+        if place.due:
             return Wanted.MORE
         return self._accept_followed(place, features, found, matches)
 
@@ -382,8 +383,9 @@ class TrackingStage:
         return replace(output, result=counts, provisional=output.result)
 
     def _as_keyframe(self, place: Place, features: Features, found: Localization, matches: Matches) -> Keyframe | None:
-        """The frame as a keyframe message if one is due."""
-        if not self._keyframe_due(place, found):
+        """The frame as a keyframe message if one is due, by these features or by those that were followed: then it was detected in for that."""
+        due, place.due = place.due or self._keyframe_due(place, found), False
+        if not due:
             return None
         keyframe = Keyframe(
             self._next_keyframe_id, features.stamp_ns, found.world_from_camera, features, found.landmark_ids, place.reference_id, place.map.map_id,
@@ -409,7 +411,8 @@ class TrackingStage:
         if self.localization_only or len(place.pending) >= self._config.keyframe.most_pending or place.unadjusted_id >= 0:
             return False  # what hangs on a keyframe that was placed by little would bend the map before that can be set right
         reference = place.map.keyframes[place.reference_id]
-        tracked_ratio = found.inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
+        known = max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
+        tracked_ratio = found.inliers / known if not place.pending else 1.0  # what a keyframe that is on its way has brought is not known yet
         depth = place.map.median_depth(place.reference_id, found.world_from_camera)
         return bool(needs_keyframe(place.last_keyframe_pose, found.world_from_camera, depth, tracked_ratio, self._config.keyframe))
 
