@@ -122,7 +122,8 @@ class Keyframe:
     """A frame that joins the map, as tracking hands it to mapping.
 
     landmark_ids (N,) int64, one per keypoint, `NO_LANDMARK` where there is none. `reference_matches` are the learned
-    matches to keyframe `reference_id` that tracking already has. The visibility counts are those of the frames since the last keyframe.
+    matches to keyframe `reference_id` that tracking already has. The visibility counts are those of the frames since the last keyframe. map_version is that of the
+    newest update of the map that tracking knew; -1 if it is not told.
     """
 
     id: int
@@ -134,6 +135,7 @@ class Keyframe:
     map_id: int
     reference_matches: Matches | None = None
     seen: VisibilityCounts | None = None
+    map_version: int = -1
 
 
 @dataclass(frozen=True, slots=True)

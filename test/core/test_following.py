@@ -21,6 +21,7 @@ from thegra_core.mapping.process import MappingProcess
 from thegra_core.mapping.service import MOST_LEFT, InlineMapping
 from thegra_core.messages import NO_LANDMARK, Features, Keyframe, MapUpdate, Run, TrackingResult, TrackingState
 from thegra_core.slam import Slam
+from thegra_core.tracking.stage import ANSWER_NS
 
 FOLLOWING = CONFIG.model_copy(update={"flow": FlowConfig(enabled=True)})
 WALK = sideways(60, 0.025)
@@ -354,12 +355,16 @@ def test_a_map_that_took_its_time_is_caught_up_with() -> None:
     assert slam.finish().losses == 0
 
 
-def test_a_keyframe_on_its_way_is_not_followed_by_another_because_few_landmarks_are_left() -> None:
+@pytest.mark.parametrize(("answer_ns", "next_one"), [(ANSWER_NS, False), (0, True)])
+def test_a_keyframe_on_its_way_is_not_followed_by_another_because_few_landmarks_are_left(monkeypatch: pytest.MonkeyPatch, answer_ns: int, next_one: bool) -> None:
     """It brings landmarks; another one right after it would bring the same, and take as long."""
-    slam, _, _ = make(WALK, FOLLOWING.model_copy(update={"keyframe": FOLLOWING.keyframe.model_copy(update={"min_tracked_ratio": 0.99, "rotation_deg": 90.0, "translation_ratio": 9.0})}))
+    monkeypatch.setattr("thegra_core.tracking.stage.ANSWER_NS", answer_ns)
+    keyframe = FOLLOWING.keyframe.model_copy(update={"min_tracked_ratio": 0.97, "rotation_deg": 90.0, "translation_ratio": 9.0})
+    slam, _, _ = make(WALK, FOLLOWING.model_copy(update={"keyframe": keyframe}))
     play(slam, 30)
     slam._mapping.updates = lambda patience_s=0.0: []  # type: ignore[method-assign]
-    assert sum(r.is_keyframe for r in play(slam, 12, 30)) == 1
+    made = [r.is_keyframe for r in play(slam, 20, 30)]
+    assert made[made.index(True) + 1] is next_one
 
 
 def test_a_keyframe_that_is_due_by_the_followed_points_is_made() -> None:
@@ -367,7 +372,7 @@ def test_a_keyframe_that_is_due_by_the_followed_points_is_made() -> None:
     slam, end, _ = make(WALK)
     play(slam, 25)
     due, asked = iter([True]), []
-    slam._tracking._keyframe_due = lambda place, found: (asked.append(found), next(due, False))[1]  # type: ignore[method-assign]
+    slam._tracking._keyframe_due = lambda place, features, found: (asked.append(found), next(due, False))[1]  # type: ignore[method-assign]
     assert [r.is_keyframe for r in play(slam, 3, 25)] == [True, False, False]
     assert end.asked[-1] is Wanted.MORE and len(asked) == 3
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from thegra_core.geometry import poses
 from thegra_core.geometry.camera import CameraModel, DistortionModel
+from thegra_core.geometry.similarity import Similarity
 from thegra_core.map.editor import MapEditor
 from thegra_core.map.map import Map
 from thegra_core.messages import NO_LANDMARK, Features, Keyframe
@@ -297,3 +299,20 @@ def test_the_heir_takes_over_what_is_placed_beside_a_removed_keyframe() -> None:
     assert [(r.id, r.heir_id) for r in removed] == [(0, 2), (1, 2)]
     for r in removed:
         np.testing.assert_allclose(before[2] @ r.heir_from_removed, before[r.id], atol=1e-12)
+
+
+def test_a_keyframe_on_its_way_when_a_loop_closes_is_moved_with_its_reference() -> None:
+    """Tracking placed it in the map as it was; the loop turns the map by 90 degrees, doubles it and shifts it."""
+    editor = MapEditor(0, CAMERA, THRESHOLD)
+    for i in range(3):
+        editor.add_keyframe(keyframe(i))
+    known = editor.take_update().version
+    turned = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    loop = Similarity(poses.transform(turned, np.array([1.0, 2, 3])), 2.0)
+    editor.note_move({0: Similarity(np.eye(4)), 1: Similarity(np.eye(4)), 2: loop})
+    told = editor.take_update().version
+    late = replace(keyframe(3), world_from_camera=poses.transform(np.eye(3), np.array([1.0, 0, 0])), map_version=known)
+    np.testing.assert_allclose(editor.carried(late).world_from_camera, poses.transform(turned, np.array([1.0, 4, 3])), atol=1e-12)
+    np.testing.assert_allclose(editor.carried(replace(late, reference_id=0)).world_from_camera, late.world_from_camera, atol=1e-12)
+    np.testing.assert_allclose(editor.carried(replace(late, reference_id=7)).world_from_camera[:3, 3], [1.0, 4, 3], atol=1e-12)
+    np.testing.assert_array_equal(editor.carried(replace(late, map_version=told)).world_from_camera, late.world_from_camera)

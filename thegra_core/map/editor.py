@@ -42,6 +42,7 @@ class MapEditor:
         self.adjusted_id = -1
         self._edges: set[int] = set()
         self._scales: dict[int, float] = {}
+        self._moves: list[tuple[int, dict[int, Similarity]]] = []
 
     @classmethod
     def restored(
@@ -198,6 +199,18 @@ class MapEditor:
         """Tell replicas by what factor the surroundings of keyframes have grown (a loop's scale drift taken out)."""
         for keyframe_id, scale in scales.items():
             self._scales[keyframe_id] = self._scales.get(keyframe_id, 1.0) * scale
+
+    def note_move(self, moves: Mapping[int, Similarity]) -> None:
+        """Remember by what each keyframe has just been moved, for keyframes that are on their way, see `carried`."""
+        self._moves.append((self.map.version + 1, dict(moves)))
+
+    def carried(self, keyframe: Keyframe) -> Keyframe:
+        """A keyframe to be added, moved with its reference by what tracking did not know yet when it found its pose; by nothing if it does not tell what it knew."""
+        self._moves = [(version, moves) for version, moves in self._moves if version > keyframe.map_version >= 0]
+        pose = Similarity(keyframe.world_from_camera)
+        for _, moves in self._moves:
+            pose = moves[keyframe.reference_id if keyframe.reference_id in moves else max(moves)] @ pose
+        return replace(keyframe, world_from_camera=pose.rigid) if self._moves else keyframe
 
     def note(self, revisit: Revisit) -> None:
         """Tell with the next update that a place was seen again."""

@@ -75,6 +75,7 @@ def _close(editor: MapEditor, sightings: list[Sighting], graph: MatchGraph, conf
     after = optimize_pose_graph(before, _edges(editor, before, sightings), min(before), depth)
     _move(editor, before, after)
     editor.rescale({i: node.scale for i, node in after.items()})
+    editor.note_move({i: node @ before[i].inverse() for i, node in after.items()})
     for sighting in sightings:
         for other, matches in sighting.matches.items():
             graph.add(sighting.keyframe_id, other, matches)

@@ -105,6 +105,7 @@ class Mapper:
     def _grow(self, keyframe: Keyframe, others_wait: Callable[[], bool]) -> Iterator[None]:
         """Stops where landmarks have come."""
         editor = self._editors[keyframe.map_id]
+        keyframe = editor.carried(keyframe)
         editor.add_keyframe(keyframe)
         editor.connect(keyframe.id)
         self._cull(editor, keyframe)

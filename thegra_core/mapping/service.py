@@ -99,17 +99,21 @@ class InlineMapping:
     def insert_by_steps(self, keyframe: Keyframe, others_wait: Callable[[], bool]) -> Iterator[MapUpdate]:
         """As `insert`, with an update after each step: the new landmarks first, for a tracker that goes on meanwhile.
 
-        Where others wait after a step the rest is left out: the next keyframe needs landmarks more than this one needs accuracy, and is adjusted with it. After
-        `MOST_LEFT` keyframes in a row everything is done all the same.
+        Where others wait the rest is left out: the next keyframe needs landmarks more than this one needs accuracy, and is adjusted with it. After `MOST_LEFT`
+        keyframes in a row everything is done all the same.
         """
         if keyframe.map_id not in self._mapper.map_ids:
             return
         self._left += 1
-        yield from self._mapper.grow(keyframe, others_wait)
-        if self._left <= MOST_LEFT and others_wait():
+
+        def is_left() -> bool:
+            return self._left <= MOST_LEFT and others_wait()
+
+        yield from self._mapper.grow(keyframe, is_left)
+        if is_left():
             return
         yield self._mapper.settle(keyframe)
-        if self._left <= MOST_LEFT and others_wait():
+        if is_left():
             return
         self._left = 0
         tied = self._mapper.tie(keyframe)

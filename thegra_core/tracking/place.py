@@ -22,7 +22,7 @@ class Place:
     """Where tracking is: a replica of a map and of its places, keyframes of it, and what has been seen since the last one.
 
     resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet, and
-    their poses. awaited_since_ns: stamp after which frames came while mapping made the map, until they have been looked at. turns: quarter turns
+    their poses; sent: the features of the newest one. awaited_since_ns: stamp after which frames came while mapping made the map, until they have been looked at. turns: quarter turns
     counter-clockwise by which images are turned before features are looked for in them, so that they lie as the map's first one does. unadjusted_id: the
     keyframe by which the camera was found again, until the map has been adjusted around it; -1 if there is none. due: a keyframe is, by the points followed to the frame in work.
     """
@@ -40,6 +40,7 @@ class Place:
     found: list[IntArray] = field(default_factory=list)
     tracks: TrackLandmarks = field(default_factory=TrackLandmarks)
     pending: dict[int, FloatArray] = field(default_factory=dict)
+    sent: Features | None = None
     awaited_since_ns: int | None = None
     turns: int = 0
     unadjusted_id: int = -1

@@ -40,6 +40,8 @@ from thegra_core.tracking.turning import FoundTurned, Turned, turn_back
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 logger = logging.getLogger(__name__)
+ANSWER_NS = 150_000_000
+"""Time that mapping may take for a keyframe, for all that it does (measured: 50 to 200 ms on one core)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +147,7 @@ class TrackingStage:
             found = (doubt_of if place.lost_frames else doubt_nearby)(place.map, found, place.reference_id, self._config) or found
         if isinstance(found, str):
             return self._recover(place, features, matches, found, turned)
-        if self._may_turn_back(place, found) and turned is not None:
+        if self._may_turn_back(place, features, found) and turned is not None:
             back = turn_back(place.map, place.reference_id, found, place.turns, turned, self._thorough or self._matcher, self._config)
             if back is not None:
                 return self._go_on_turned(place, back)
@@ -173,7 +175,7 @@ class TrackingStage:
             logger.debug("followed keypoints at %.3f s: %s", features.stamp_ns / 1e9, found.reason)
             self.lacks_landmarks = bool(place.pending) and not found.misled
             return Wanted.ANEW if found.misled else Wanted.MORE
-        place.due = self._keyframe_due(place, found)
+        place.due = self._keyframe_due(place, features, found)
         if place.due:
             return Wanted.MORE
         return self._accept_followed(place, features, found, matches)
@@ -232,7 +234,10 @@ class TrackingStage:
             place.tracks.take(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
         if newest in before and newest in place.map.keyframes:
             corrected = Similarity(place.map.keyframes[newest].world_from_camera, update.scales.get(newest, 1.0))
-            place.motion.move(corrected @ Similarity(before[newest]).inverse())
+            moved = corrected @ Similarity(before[newest]).inverse()
+            place.motion.move(moved)
+            if update.scales:
+                place.pending = {i: (moved @ Similarity(pose)).rigid for i, pose in place.pending.items()}
 
     def _move_into(self, update: MapUpdate, absorbed: Absorbed) -> None:
         """Go on in the map that has taken in the current one; that the two fit proves the current one."""
@@ -384,22 +389,22 @@ class TrackingStage:
 
     def _as_keyframe(self, place: Place, features: Features, found: Localization, matches: Matches) -> Keyframe | None:
         """The frame as a keyframe message if one is due, by these features or by those that were followed: then it was detected in for that."""
-        due, place.due = place.due or self._keyframe_due(place, found), False
+        due, place.due = place.due or self._keyframe_due(place, features, found), False
         if not due:
             return None
         keyframe = Keyframe(
             self._next_keyframe_id, features.stamp_ns, found.world_from_camera, features, found.landmark_ids, place.reference_id, place.map.map_id,
-            matches, place.take_counts(),
+            matches, place.take_counts(), place.map.version,
         )  # fmt: skip
         self._next_keyframe_id += 1
-        place.pending[keyframe.id] = keyframe.world_from_camera
+        place.pending[keyframe.id], place.sent = keyframe.world_from_camera, features
         return keyframe
 
-    def _may_turn_back(self, place: Place, found: Localization) -> bool:
+    def _may_turn_back(self, place: Place, features: Features, found: Localization) -> bool:
         """Whether a tracked frame is one to be looked for turned: not every one, for that costs an extraction."""
         if not self._config.loop.rotations or place.lost_frames or place.probation:
             return False
-        return self.localization_only or self._keyframe_due(place, found)
+        return self.localization_only or self._keyframe_due(place, features, found)
 
     def _go_on_turned(self, place: Place, found: FoundTurned) -> TrackingOutput:
         """Accept a frame by the features of another orientation; the images to come are turned alike."""
@@ -407,13 +412,11 @@ class TrackingStage:
         logger.info("from %.3f s on images are turned by %d degrees", found.features.stamp_ns / 1e9, 90 * place.turns)
         return replace(self._accept(place, found.features, found.localization, found.matches), found_turned=found.features)
 
-    def _keyframe_due(self, place: Place, found: Localization) -> bool:
+    def _keyframe_due(self, place: Place, features: Features, found: Localization) -> bool:
         if self.localization_only or len(place.pending) >= self._config.keyframe.most_pending or place.unadjusted_id >= 0:
             return False  # what hangs on a keyframe that was placed by little would bend the map before that can be set right
-        reference = place.map.keyframes[place.reference_id]
-        known = max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
-        tracked_ratio = found.inliers / known if not place.pending else 1.0  # what a keyframe that is on its way has brought is not known yet
         depth = place.map.median_depth(place.reference_id, found.world_from_camera)
+        tracked_ratio = _tracked_ratio(place, features, found)
         return bool(needs_keyframe(place.last_keyframe_pose, found.world_from_camera, depth, tracked_ratio, self._config.keyframe))
 
     def _recover(self, place: Place, features: Features, matches: Matches, reason: str, turned: Turned | None) -> TrackingOutput:
@@ -488,3 +491,14 @@ class TrackingStage:
         dropped = self._place.map.map_id
         self._place, self._before = self._before, None
         return dropped
+
+
+def _tracked_ratio(place: Place, features: Features, found: Localization) -> float:
+    """How much of the last keyframe a frame still sees: the landmarks of the reference, or, where a newer keyframe has been made too short a time ago for mapping to
+    have told its landmarks, the points followed."""
+    sent = place.sent
+    if place.pending and sent is not None and sent.track_ids is not None and features.track_ids is not None and features.stamp_ns - sent.stamp_ns < ANSWER_NS:
+        tracks = sent.track_ids[sent.track_ids >= 0]
+        return float(np.isin(tracks, features.track_ids).sum()) / max(len(tracks), 1)
+    reference = place.map.keyframes[place.reference_id]
+    return found.inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)

@@ -107,7 +107,7 @@ def table_matches(table: Table) -> Matches:
 def keyframe_tables(keyframe: Keyframe) -> list[Table]:
     """Features with landmark ids, the pose, and the matches and visibility counts there are."""
     features = features_table(keyframe.features)
-    facts = {"keyframe": str(keyframe.id), "keyframe_stamp_ns": str(keyframe.stamp_ns), "reference": str(keyframe.reference_id), "map": str(keyframe.map_id)}
+    facts = {"keyframe": str(keyframe.id), "keyframe_stamp_ns": str(keyframe.stamp_ns), "reference": str(keyframe.reference_id), "map": str(keyframe.map_id), "map_version": str(keyframe.map_version)}
     tables = [Table({**features.columns, "landmark_id": keyframe.landmark_ids}, {**features.facts, **facts}), _pose_table({keyframe.id: keyframe.world_from_camera})]
     if keyframe.reference_matches is not None:
         tables.append(matches_table(keyframe.reference_matches))
@@ -123,7 +123,7 @@ def tables_keyframes(tables: list[Table]) -> list[Keyframe]:
         facts = table.facts
         if "keyframe" in facts:
             keyframes.append(
-                Keyframe(int(facts["keyframe"]), int(facts["keyframe_stamp_ns"]), np.eye(4), table_features(table), _ids(table, "landmark_id"), int(facts["reference"]), int(facts["map"]))
+                Keyframe(int(facts["keyframe"]), int(facts["keyframe_stamp_ns"]), np.eye(4), table_features(table), _ids(table, "landmark_id"), int(facts["reference"]), int(facts["map"]), map_version=int(facts["map_version"]))
             )
         elif "poses" in facts:
             keyframes[-1] = replace(keyframes[-1], world_from_camera=_poses(table)[keyframes[-1].id])
