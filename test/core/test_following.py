@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,9 +20,9 @@ from thegra_core.features.tracks import TrackMatcher
 from thegra_core.mapping.mapper import Mapper
 from thegra_core.mapping.process import MappingProcess
 from thegra_core.mapping.service import MOST_LEFT, InlineMapping
-from thegra_core.messages import NO_LANDMARK, Features, Keyframe, MapUpdate, Run, TrackingResult, TrackingState
+from thegra_core.messages import NO_LANDMARK, UNFOLLOWED, Features, Keyframe, MapUpdate, Run, TrackingResult, TrackingState
 from thegra_core.slam import Slam
-from thegra_core.tracking.stage import ANSWER_NS
+from thegra_core.tracking.stage import ANSWER_NS, _tracked_ratio
 
 FOLLOWING = CONFIG.model_copy(update={"flow": FlowConfig(enabled=True)})
 WALK = sideways(60, 0.025)
@@ -355,16 +356,19 @@ def test_a_map_that_took_its_time_is_caught_up_with() -> None:
     assert slam.finish().losses == 0
 
 
-@pytest.mark.parametrize(("answer_ns", "next_one"), [(ANSWER_NS, False), (0, True)])
-def test_a_keyframe_on_its_way_is_not_followed_by_another_because_few_landmarks_are_left(monkeypatch: pytest.MonkeyPatch, answer_ns: int, next_one: bool) -> None:
-    """It brings landmarks; another one right after it would bring the same, and take as long."""
-    monkeypatch.setattr("thegra_core.tracking.stage.ANSWER_NS", answer_ns)
-    keyframe = FOLLOWING.keyframe.model_copy(update={"min_tracked_ratio": 0.97, "rotation_deg": 90.0, "translation_ratio": 9.0})
-    slam, _, _ = make(WALK, FOLLOWING.model_copy(update={"keyframe": keyframe}))
+@pytest.mark.parametrize(("pending", "age_ns", "ratio"), [(True, ANSWER_NS - 1, 0.75), (True, ANSWER_NS, 0.2), (False, 1, 0.2)])
+def test_how_much_of_a_keyframe_without_an_answer_is_seen_is_told_by_its_tracks(pending: bool, age_ns: int, ratio: float) -> None:
+    """Its landmarks are not known yet, and those of the one before are few by then: without its tracks the next frame would be a keyframe, too."""
+    slam, _, _ = make(WALK)
     play(slam, 30)
-    slam._mapping.updates = lambda patience_s=0.0: []  # type: ignore[method-assign]
-    made = [r.is_keyframe for r in play(slam, 20, 30)]
-    assert made[made.index(True) + 1] is next_one
+    place = slam._tracking._place
+    assert place is not None and place.sent is not None
+    sent = replace(place.sent, track_ids=np.where(np.arange(len(place.sent)) < 100, np.arange(len(place.sent)), UNFOLLOWED))
+    place.sent, place.pending = sent, {99: np.eye(4)} if pending else {}
+    now = replace(sent.chosen(np.arange(25, 100)), stamp_ns=sent.stamp_ns + age_ns)
+    known = int((place.map.landmarks.rows(place.map.keyframes[place.reference_id].landmark_ids) >= 0).sum())
+    found = SimpleNamespace(inliers=0.2 * known)
+    assert _tracked_ratio(place, now, found) == pytest.approx(ratio)  # type: ignore[arg-type]
 
 
 def test_a_keyframe_that_is_due_by_the_followed_points_is_made() -> None:
