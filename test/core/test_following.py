@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from thegra_core.mapping.process import MappingProcess
 from thegra_core.mapping.service import MOST_LEFT, InlineMapping
 from thegra_core.messages import NO_LANDMARK, UNFOLLOWED, Features, Keyframe, MapUpdate, Run, TrackingResult, TrackingState
 from thegra_core.slam import Slam
-from thegra_core.tracking.stage import ANSWER_NS, _tracked_ratio
+from thegra_core.tracking.keyframe_policy import ANSWER_NS, tracked_ratio
 
 FOLLOWING = CONFIG.model_copy(update={"flow": FlowConfig(enabled=True)})
 WALK = sideways(60, 0.025)
@@ -362,23 +361,24 @@ def test_how_much_of_a_keyframe_without_an_answer_is_seen_is_told_by_its_tracks(
     slam, _, _ = make(WALK)
     play(slam, 30)
     place = slam._tracking._place
-    assert place is not None and place.sent is not None
-    sent = replace(place.sent, track_ids=np.where(np.arange(len(place.sent)) < 100, np.arange(len(place.sent)), UNFOLLOWED))
-    place.sent, place.pending = sent, {99: np.eye(4)} if pending else {}
+    assert place is not None
+    known, count = place.map.keyframes[place.reference_id], len(place.reference)
+    ids = np.arange(count)
+    sent = replace(known.features, track_ids=np.where(ids < 100, ids, UNFOLLOWED))
+    place.pending = {99: Keyframe(99, sent.stamp_ns, np.eye(4), sent, np.full(count, NO_LANDMARK), 0, 0)} if pending else {}
     now = replace(sent.chosen(np.arange(25, 100)), stamp_ns=sent.stamp_ns + age_ns)
-    known = int((place.map.landmarks.rows(place.map.keyframes[place.reference_id].landmark_ids) >= 0).sum())
-    found = SimpleNamespace(inliers=0.2 * known)
-    assert _tracked_ratio(place, now, found) == pytest.approx(ratio)  # type: ignore[arg-type]
+    landmarks = int((place.map.landmarks.rows(known.landmark_ids) >= 0).sum())
+    assert tracked_ratio(place, now, landmarks // 5) == pytest.approx(ratio, abs=0.01)
 
 
-def test_a_keyframe_that_is_due_by_the_followed_points_is_made() -> None:
+def test_a_keyframe_that_is_due_by_the_followed_points_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     """The image has been detected in for it; that more landmarks are found so does not make it needless, for they are not all followed."""
     slam, end, _ = make(WALK)
     play(slam, 25)
-    due, asked = iter([True]), []
-    slam._tracking._keyframe_due = lambda place, features, found: (asked.append(found), next(due, False))[1]  # type: ignore[method-assign]
+    answers = iter(["due by the followed points"])
+    monkeypatch.setattr("thegra_core.tracking.stage.needs_keyframe", lambda *_: next(answers, ""))
     assert [r.is_keyframe for r in play(slam, 3, 25)] == [True, False, False]
-    assert end.asked[-1] is Wanted.MORE and len(asked) == 3
+    assert end.asked[-1] is Wanted.MORE
 
 
 def test_tracking_goes_on_while_mapping_is_behind(beside: Slam) -> None:

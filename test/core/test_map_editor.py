@@ -309,7 +309,7 @@ def test_a_keyframe_on_its_way_when_a_loop_closes_is_moved_with_its_reference() 
     known = editor.take_update().version
     turned = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     loop = Similarity(poses.transform(turned, np.array([1.0, 2, 3])), 2.0)
-    editor.note_move({0: Similarity(np.eye(4)), 1: Similarity(np.eye(4)), 2: loop})
+    editor.note_moves({0: Similarity(np.eye(4)), 1: Similarity(np.eye(4)), 2: loop})
     told = editor.take_update().version
     late = replace(keyframe(3), world_from_camera=poses.transform(np.eye(3), np.array([1.0, 0, 0])), map_version=known)
     np.testing.assert_allclose(editor.carried(late).world_from_camera, poses.transform(turned, np.array([1.0, 4, 3])), atol=1e-12)

@@ -195,14 +195,11 @@ class MapEditor:
         self.map.landmarks.points_world[rows[rows >= 0]] = points_world[rows >= 0]
         self._landmarks.update(landmark_ids[rows >= 0].tolist())
 
-    def rescale(self, scales: Mapping[int, float]) -> None:
-        """Tell replicas by what factor the surroundings of keyframes have grown (a loop's scale drift taken out)."""
-        for keyframe_id, scale in scales.items():
-            self._scales[keyframe_id] = self._scales.get(keyframe_id, 1.0) * scale
-
-    def note_move(self, moves: Mapping[int, Similarity]) -> None:
-        """Remember by what each keyframe has just been moved, for keyframes that are on their way, see `carried`."""
+    def note_moves(self, moves: Mapping[int, Similarity]) -> None:
+        """A loop has moved keyframes so: tell replicas by what factor their surroundings have grown, and remember it for keyframes on their way, see `carried`."""
         self._moves.append((self.map.version + 1, dict(moves)))
+        for keyframe_id, moved in moves.items():
+            self._scales[keyframe_id] = self._scales.get(keyframe_id, 1.0) * moved.scale
 
     def carried(self, keyframe: Keyframe) -> Keyframe:
         """A keyframe to be added, moved with its reference by what tracking did not know yet when it found its pose; by nothing if it does not tell what it knew."""

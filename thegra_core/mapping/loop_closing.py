@@ -73,9 +73,9 @@ def _close(editor: MapEditor, sightings: list[Sighting], graph: MatchGraph, conf
     drift = drift_of(current, sightings[-1])
     depth = current.median_depth(sightings[-1].keyframe_id)
     after = optimize_pose_graph(before, _edges(editor, before, sightings), min(before), depth)
-    _move(editor, before, after)
-    editor.rescale({i: node.scale for i, node in after.items()})
-    editor.note_move({i: node @ before[i].inverse() for i, node in after.items()})
+    moves = {i: node @ before[i].inverse() for i, node in after.items()}
+    _move(editor, after, moves)
+    editor.note_moves(moves)
     for sighting in sightings:
         for other, matches in sighting.matches.items():
             graph.add(sighting.keyframe_id, other, matches)
@@ -107,7 +107,7 @@ def _edges(editor: MapEditor, world_from: dict[int, Similarity], sightings: list
     return edges
 
 
-def _move(editor: MapEditor, before: dict[int, Similarity], after: dict[int, Similarity]) -> None:
+def _move(editor: MapEditor, after: dict[int, Similarity], moves: dict[int, Similarity]) -> None:
     """Carry poses, and each landmark with the keyframe that saw it first."""
     current = editor.map
     ids = current.landmarks.alive_ids()
@@ -115,7 +115,7 @@ def _move(editor: MapEditor, before: dict[int, Similarity], after: dict[int, Sim
     carriers = np.array([editor.carrier(i) for i in ids.tolist()], dtype=np.int64)
     for carrier in np.unique(carriers).tolist():
         mine = carriers == carrier
-        points[mine] = (after[carrier] @ before[carrier].inverse()).apply(points[mine])
+        points[mine] = moves[carrier].apply(points[mine])
     keyframes = np.array(sorted(after), dtype=np.int64)
     editor.move(keyframes, np.stack([after[i].rigid for i in keyframes.tolist()]), ids, points)
 

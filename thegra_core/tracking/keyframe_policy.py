@@ -7,8 +7,12 @@ from numpy.typing import NDArray
 
 from thegra_core.config import KeyframeConfig
 from thegra_core.geometry import poses
+from thegra_core.messages import Features
+from thegra_core.tracking.place import Place
 
 FloatArray = NDArray[np.float64]
+ANSWER_NS = 150_000_000
+"""Time that mapping may take for a keyframe, with all that it does for it."""
 
 
 def needs_keyframe(
@@ -27,3 +31,14 @@ def needs_keyframe(
     if tracked_ratio < config.min_tracked_ratio:
         return "few landmarks tracked"
     return ""
+
+
+def tracked_ratio(place: Place, features: Features, inliers: int) -> float:
+    """How much of the last keyframe a frame still sees: landmarks (`inliers`) over those of the reference, or, where a newer keyframe has been made too short a time
+    ago for mapping to have told its landmarks, the share of its tracks."""
+    newest = place.pending[max(place.pending)].features if place.pending else None
+    if newest is not None and newest.track_ids is not None and features.track_ids is not None and features.stamp_ns - newest.stamp_ns < ANSWER_NS:
+        tracks = newest.track_ids[newest.track_ids >= 0]
+        return float(np.isin(tracks, features.track_ids).sum()) / max(len(tracks), 1)
+    reference = place.map.keyframes[place.reference_id]
+    return inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.map.map import Map
-from thegra_core.messages import Features, MapUpdate, VisibilityCounts
+from thegra_core.messages import Features, Keyframe, MapUpdate, VisibilityCounts
 from thegra_core.places.index import PlaceIndex
 from thegra_core.tracking.followed import TrackLandmarks
 from thegra_core.tracking.motion import MotionModel
@@ -21,10 +21,10 @@ IntArray = NDArray[np.int64]
 class Place:
     """Where tracking is: a replica of a map and of its places, keyframes of it, and what has been seen since the last one.
 
-    resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet, and
-    their poses; sent: the features of the newest one. awaited_since_ns: stamp after which frames came while mapping made the map, until they have been looked at. turns: quarter turns
-    counter-clockwise by which images are turned before features are looked for in them, so that they lie as the map's first one does. unadjusted_id: the
-    keyframe by which the camera was found again, until the map has been adjusted around it; -1 if there is none. due: a keyframe is, by the points followed to the frame in work.
+    resumed: the map was made in another run, so that its stamps say nothing about this one. pending: keyframes that mapping has not answered yet.
+    awaited_since_ns: stamp after which frames came while mapping made the map, until they have been looked at. turns: quarter turns counter-clockwise by which
+    images are turned before features are looked for in them, so that they lie as the map's first one does. unadjusted_id: the keyframe by which the camera was
+    found again, until the map has been adjusted around it; -1 if there is none. due_ns: stamp of the last frame that is to be a keyframe by its followed points.
     """
 
     map: Map
@@ -39,12 +39,11 @@ class Place:
     visible: list[IntArray] = field(default_factory=list)
     found: list[IntArray] = field(default_factory=list)
     tracks: TrackLandmarks = field(default_factory=TrackLandmarks)
-    pending: dict[int, FloatArray] = field(default_factory=dict)
-    sent: Features | None = None
+    pending: dict[int, Keyframe] = field(default_factory=dict)
     awaited_since_ns: int | None = None
     turns: int = 0
     unadjusted_id: int = -1
-    due: bool = False
+    due_ns: int = -1
 
     @property
     def begun(self) -> bool:
@@ -57,7 +56,7 @@ class Place:
 
     @property
     def last_keyframe_pose(self) -> FloatArray:
-        return self.pending[max(self.pending)] if self.pending else self.map.keyframes[self.last_keyframe_id].world_from_camera
+        return self.pending[max(self.pending)].world_from_camera if self.pending else self.map.keyframes[self.last_keyframe_id].world_from_camera
 
     def take(self, update: MapUpdate) -> None:
         self.map.apply(update)

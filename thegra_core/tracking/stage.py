@@ -31,7 +31,7 @@ from thegra_core.places.index import PlaceIndex
 from thegra_core.process import Submit, call_now
 from thegra_core.tracking.followed import NotPlaced, localize_followed
 from thegra_core.tracking.initializer import Initializer
-from thegra_core.tracking.keyframe_policy import needs_keyframe
+from thegra_core.tracking.keyframe_policy import needs_keyframe, tracked_ratio
 from thegra_core.tracking.place import Place
 from thegra_core.tracking.relocalizer import doubt_nearby, doubt_of, evidence, last_keyframes, nearest_in_time, relocalize, similar_keyframes
 from thegra_core.tracking.tracker import FrameView, Localization, best_reference, localize
@@ -40,8 +40,6 @@ from thegra_core.tracking.turning import FoundTurned, Turned, turn_back
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 logger = logging.getLogger(__name__)
-ANSWER_NS = 150_000_000
-"""Time that mapping may take for a keyframe, for all that it does (measured: 50 to 200 ms on one core)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,8 +173,8 @@ class TrackingStage:
             logger.debug("followed keypoints at %.3f s: %s", features.stamp_ns / 1e9, found.reason)
             self.lacks_landmarks = bool(place.pending) and not found.misled
             return Wanted.ANEW if found.misled else Wanted.MORE
-        place.due = self._keyframe_due(place, features, found)
-        if place.due:
+        if self._keyframe_due(place, features, found):
+            place.due_ns = features.stamp_ns
             return Wanted.MORE
         return self._accept_followed(place, features, found, matches)
 
@@ -237,7 +235,7 @@ class TrackingStage:
             moved = corrected @ Similarity(before[newest]).inverse()
             place.motion.move(moved)
             if update.scales:
-                place.pending = {i: (moved @ Similarity(pose)).rigid for i, pose in place.pending.items()}
+                place.pending = {i: replace(k, world_from_camera=(moved @ Similarity(k.world_from_camera)).rigid) for i, k in place.pending.items()}
 
     def _move_into(self, update: MapUpdate, absorbed: Absorbed) -> None:
         """Go on in the map that has taken in the current one; that the two fit proves the current one."""
@@ -388,16 +386,15 @@ class TrackingStage:
         return replace(output, result=counts, provisional=output.result)
 
     def _as_keyframe(self, place: Place, features: Features, found: Localization, matches: Matches) -> Keyframe | None:
-        """The frame as a keyframe message if one is due, by these features or by those that were followed: then it was detected in for that."""
-        due, place.due = place.due or self._keyframe_due(place, features, found), False
-        if not due:
+        """The frame as a keyframe message if one is due."""
+        if not self._keyframe_due(place, features, found):
             return None
         keyframe = Keyframe(
             self._next_keyframe_id, features.stamp_ns, found.world_from_camera, features, found.landmark_ids, place.reference_id, place.map.map_id,
             matches, place.take_counts(), place.map.version,
         )  # fmt: skip
         self._next_keyframe_id += 1
-        place.pending[keyframe.id], place.sent = keyframe.world_from_camera, features
+        place.pending[keyframe.id] = keyframe
         return keyframe
 
     def _may_turn_back(self, place: Place, features: Features, found: Localization) -> bool:
@@ -415,9 +412,10 @@ class TrackingStage:
     def _keyframe_due(self, place: Place, features: Features, found: Localization) -> bool:
         if self.localization_only or len(place.pending) >= self._config.keyframe.most_pending or place.unadjusted_id >= 0:
             return False  # what hangs on a keyframe that was placed by little would bend the map before that can be set right
+        if place.due_ns == features.stamp_ns:
+            return True  # by the followed points, and the image was detected in for it
         depth = place.map.median_depth(place.reference_id, found.world_from_camera)
-        tracked_ratio = _tracked_ratio(place, features, found)
-        return bool(needs_keyframe(place.last_keyframe_pose, found.world_from_camera, depth, tracked_ratio, self._config.keyframe))
+        return bool(needs_keyframe(place.last_keyframe_pose, found.world_from_camera, depth, tracked_ratio(place, features, found.inliers), self._config.keyframe))
 
     def _recover(self, place: Place, features: Features, matches: Matches, reason: str, turned: Turned | None) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
@@ -491,14 +489,3 @@ class TrackingStage:
         dropped = self._place.map.map_id
         self._place, self._before = self._before, None
         return dropped
-
-
-def _tracked_ratio(place: Place, features: Features, found: Localization) -> float:
-    """How much of the last keyframe a frame still sees: the landmarks of the reference, or, where a newer keyframe has been made too short a time ago for mapping to
-    have told its landmarks, the points followed."""
-    sent = place.sent
-    if place.pending and sent is not None and sent.track_ids is not None and features.track_ids is not None and features.stamp_ns - sent.stamp_ns < ANSWER_NS:
-        tracks = sent.track_ids[sent.track_ids >= 0]
-        return float(np.isin(tracks, features.track_ids).sum()) / max(len(tracks), 1)
-    reference = place.map.keyframes[place.reference_id]
-    return found.inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
