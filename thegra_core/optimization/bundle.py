@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from thegra_core.geometry import poses
 from thegra_core.optimization.factor_graph import FactorGraph
 from thegra_core.optimization.schur import SchurSystem
+from thegra_core.optimization.undetermined import undetermined
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -67,7 +68,8 @@ MINIMIZERS: dict[str, Callable[[BundleProblem, float], Minimizer]] = {"gtsam": F
 def bundle_adjust(
     problem: BundleProblem, huber_px: float, chi2_px2: float, iterations: int, tolerance: float = 1e-5, solver: str = "gtsam"
 ) -> BundleResult:
-    """Minimise Huber(e^T Omega e) over poses and points in two stages; outliers are left out of the second and marked again at the end.
+    """Minimise Huber(e^T Omega e) over poses and points in two stages; outliers are left out of the second and marked again at the end. Points that their views do
+    not tell take no part: those views may be a few of many.
 
     A stage ends after `iterations` steps (the first after half of them), or when a step lessens the cost by less than its share `tolerance`.
 
@@ -110,6 +112,8 @@ def _solve(
 ) -> tuple[FloatArray, FloatArray]:
     seen = np.bincount(problem.point_index[used], minlength=len(points_world))
     used = used & (seen[problem.point_index] >= 2)
+    camera_from_world = np.stack([poses.inverse(pose) for pose in world_from_camera])
+    used &= ~undetermined(camera_from_world, points_world, problem.keyframe_index[used], problem.point_index[used])[problem.point_index]
     point_rows = np.flatnonzero(np.bincount(problem.point_index[used], minlength=len(points_world)))
     keyframe_rows = np.flatnonzero(np.bincount(problem.keyframe_index[used], minlength=len(world_from_camera)))
     if len(point_rows) == 0 or bool(np.all(problem.fixed[keyframe_rows])):
