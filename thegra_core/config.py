@@ -193,6 +193,7 @@ class ExtractorConfig(Section):
     nms_radius: int | None = Field(None, ge=1, le=32, description="px; none: what the network was published with (superpoint 4, aliked 2, xfeat 2); sift and orb have their own")
     crowding: float = Field(1.0, ge=0, description="most keypoints of an image cell over its even share, as long as other cells have any; 0: the strongest wherever they are, as in the paper (measured)")
     border: int = Field(4, ge=0, le=64, description="px at the image's edge without keypoints")
+    corners: int = Field(0, ge=0, le=8192, description="xfeat: so many keypoints may be corners of the whole image, before those that the network detects, which it describes alike; what is followed is placed exactly at a corner, and slides along an edge (measured)")
     subpixel: bool = Field(True, description="superpoint: move keypoints from the whole pixel to the centre of mass of the 3x3 scores; measured: median epipolar error 9, 5 and 1 % less on three sequences; the paper's network gives whole pixels")
     long_side: int | None = Field(None, ge=128, description="px; images are scaled so that the long side has this length before detection; none: as they are")
     device: str = Field("auto", description="auto, cpu, cuda, cuda:0, ...")

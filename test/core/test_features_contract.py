@@ -209,6 +209,44 @@ def test_xfeat_finds_what_its_own_pipeline_finds() -> None:
     np.testing.assert_allclose(features.descriptors, expected["descriptors"], atol=1e-4)
 
 
+def test_xfeat_describes_corners_before_what_it_detects() -> None:
+    """Corners come first and keep their places; what is described at the place of a detection is what it was described by alone."""
+    require("xfeat")
+    from thegra_core.features.corners import corners
+    from thegra_core.features.flow import normalize_contrast
+    from thegra_core.features.xfeat import SAME_PX
+
+    image = view()
+    config = ExtractorConfig(name="xfeat", max_keypoints=400, border=8, crowding=0, device="cpu", long_side=256)
+    alone, both = make_extractor(config).extract(image, 0), make_extractor(config.model_copy(update={"corners": 150})).extract(image, 0)
+    expected, _ = corners(normalize_contrast(image), 150, 8)
+    assert_keeps_contract(both, "xfeat", SIZE)
+    np.testing.assert_allclose(both.keypoints[:150], expected, atol=1e-3)
+    assert both.scores[149] > both.scores[150:].max()
+    rest = both.keypoints[150:]
+    apart = np.linalg.norm(rest[:, None] - expected[None], axis=2).min(axis=1)
+    assert apart.min() > SAME_PX  # on the scaled image, which is smaller
+    distance = np.linalg.norm(rest[:, None] - alone.keypoints[None], axis=2)
+    same, there = np.nonzero(distance < 1e-3)
+    assert len(same) > 100
+    np.testing.assert_allclose(both.descriptors[150:][same], alone.descriptors[there], atol=1e-5)
+
+
+@pytest.mark.parametrize(("angle_deg", "shift"), [(0.0, (7.4, -5.3)), (12.0, (3.0, 4.0))])
+def test_corners_of_a_known_motion_are_matched_more_exactly(angle_deg: float, shift: tuple[float, float]) -> None:
+    require("xfeat")
+    spread_px = []
+    for count in (0, 300):
+        config = ExtractorConfig(name="xfeat", max_keypoints=300, device="cpu", corners=count)
+        reference, query = make_extractor(config).extract(view(), 1), make_extractor(config).extract(view(angle_deg, shift), 2)
+        matches = matcher("xfeat", "auto").match(query, reference)
+        errors = query.keypoints[matches.indices[:, 0]] - moved(reference.keypoints[matches.indices[:, 1]], angle_deg, shift)
+        right = np.linalg.norm(errors, axis=1) < 3
+        assert right.mean() > 0.7 and right.sum() > 60
+        spread_px.append(float(np.median(np.linalg.norm(errors[right] - errors[right].mean(axis=0), axis=1))))
+    assert spread_px[1] < 0.7 * spread_px[0]
+
+
 def test_superpoint_finds_isolated_maxima_and_their_centres() -> None:
     from thegra_core.features.detection import centroids, strongest, suppress
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from kornia.feature import XFeat as XFeatPipeline
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -15,14 +16,18 @@ from thegra_core.config import ExtractorConfig
 from thegra_core.features.assemble import described, scaled_image, selected
 from thegra_core.features.backends import Compiled, Replaced, chosen, export, exported_path
 from thegra_core.features.checkpoint import load_checkpoint, load_exactly
+from thegra_core.features.corners import corners
 from thegra_core.features.detection import strict_maxima
 from thegra_core.features.device import resolve_device
+from thegra_core.features.flow import normalize_contrast
 from thegra_core.messages import Features
 
 _MULTIPLE = 32
 NMS_RADIUS = 2
 CANDIDATES = 4
 """Times as many detections as keypoints among which these are spread."""
+SAME_PX = 3.0
+"""px around a corner in which a detection is that corner's."""
 OUTPUTS = ("features", "keypoints", "reliability")
 """Maps of the network, in its order."""
 
@@ -58,9 +63,25 @@ class XFeat:
         strongest = strongest[scores[strongest] > 0]
         maxima, scores = maxima[strongest], scores[strongest]
         ratio = np.asarray(size) / np.asarray(seen)
-        raw, rows = selected(config, image_size, scale, (maxima + 0.5) * ratio - 0.5, scores, np.ones(len(scores), bool))
-        vectors = _sampled(functional.normalize(descriptors, dim=1), torch.from_numpy(maxima[rows]), seen, "bicubic")
+        places = (maxima + 0.5) * ratio - 0.5
+        if config.corners:
+            places, scores = _with_corners(image, scale, places, scores, config)
+        raw, rows = selected(config, image_size, scale, places, scores, np.ones(len(scores), bool))
+        vectors = _sampled(functional.normalize(descriptors, dim=1), torch.from_numpy((places[rows] + 0.5) / ratio - 0.5), seen, "bicubic")
         return described(config, stamp_ns, image_size, raw, scores[rows], functional.normalize(vectors, dim=-1).numpy())
+
+
+def _with_corners(
+    image: NDArray[np.uint8], scale: tuple[float, float], places: NDArray[np.float64], scores: NDArray[np.float32], config: ExtractorConfig
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Corners of the image before the detections that are not theirs, all as pixels of the scaled image; every corner has a better score than any detection."""
+    found, _ = corners(normalize_contrast(image), config.corners, config.border)
+    theirs = (found + 0.5) * np.asarray(scale) - 0.5
+    if len(found) and len(places):
+        away = cKDTree(theirs).query(places)[0] > SAME_PX
+        places, scores = places[away], scores[away]
+    order = 1 - np.arange(len(found), dtype=np.float32) / max(2 * len(found), 1)
+    return np.concatenate((theirs, places)), np.concatenate((order, 0.5 * scores / scores.max() if len(scores) else scores))
 
 
 def _network() -> nn.Module:

@@ -18,6 +18,7 @@ NEAREST_SHARE = 0.01
 _DOUBTFUL = 1e-6
 """Determinant over cubed trace of the information below which the ratio is looked at: above it, it is less than a tenth of `MOST_ELONGATED`."""
 _NEAREST = 1e-12
+_compile = numba.njit(cache=True, error_model="numpy")
 
 
 def undetermined(camera_from_world: FloatArray, points_world: FloatArray, keyframe_index: IntArray, point_index: IntArray) -> BoolArray:
@@ -36,9 +37,7 @@ def undetermined(camera_from_world: FloatArray, points_world: FloatArray, keyfra
     return np.asarray(result)
 
 
-@numba.njit(
-    numba.types.Tuple((numba.float64[:, :, ::1], numba.float64[::1]))(numba.float64[:, :, ::1], numba.float64[:, ::1], numba.int64[::1], numba.int64[::1]), cache=True, error_model="numpy"
-)
+@_compile
 def _seen(camera_from_world: FloatArray, points_world: FloatArray, keyframe_index: IntArray, point_index: IntArray) -> tuple[FloatArray, FloatArray]:
     """Information (P, 3, 3) of all observations, of unit weight in normalized coordinates, and the depth (M,) of each, on whichever side of the camera."""
     information, slopes, depth = np.zeros((len(points_world), 3, 3)), np.empty((2, 3)), np.empty(len(point_index))
