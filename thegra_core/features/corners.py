@@ -14,14 +14,11 @@ _SLOPE = 3
 _FLAT = 1e-12
 
 
-def corners(image: NDArray[np.uint8], count: int, border: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """At most `count` corners of a contrast-normalized image (H, W), strongest first, at least `border` px inside.
+def corners(image: NDArray[np.uint8], count: int, border: int) -> NDArray[np.float64]:
+    """At most `count` corners of a contrast-normalized image (H, W) as pixels (N, 2), strongest first, at least `border` px inside.
 
     A corner's strength is the least eigenvalue of its square's gradient matrix: how exactly a point is placed in the direction in which it is placed worst. It lies
     below the pixel, at the vertex of a parabola through the neighbours' strengths.
-
-    Returns:
-        Pixels (N, 2) and strengths (N,) in (0, 1], of the strongest.
     """
     strength = np.asarray(cv2.cornerMinEigenVal(image, BLOCK, ksize=_SLOPE), np.float32)
     margin = border + 1  # what is moved below the pixel stays inside
@@ -33,8 +30,7 @@ def corners(image: NDArray[np.uint8], count: int, border: int) -> tuple[NDArray[
     x, y = columns[best], rows[best]
     at = strength[y, x]
     right, down = _vertex(strength[y, x - 1], at, strength[y, x + 1]), _vertex(strength[y - 1, x], at, strength[y + 1, x])
-    pixels = np.stack((x + right, y + down), axis=1).astype(np.float64)
-    return pixels, (at / at[0] if len(at) else at)
+    return np.stack((x + right, y + down), axis=1).astype(np.float64)
 
 
 def _vertex(before: NDArray[np.float32], at: NDArray[np.float32], after: NDArray[np.float32]) -> NDArray[np.float32]:

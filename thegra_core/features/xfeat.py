@@ -27,7 +27,7 @@ NMS_RADIUS = 2
 CANDIDATES = 4
 """Times as many detections as keypoints among which these are spread."""
 SAME_PX = 3.0
-"""px around a corner in which a detection is that corner's."""
+"""px, of what the network sees, around a corner in which a detection is that corner's."""
 OUTPUTS = ("features", "keypoints", "reliability")
 """Maps of the network, in its order."""
 
@@ -63,25 +63,23 @@ class XFeat:
         strongest = strongest[scores[strongest] > 0]
         maxima, scores = maxima[strongest], scores[strongest]
         ratio = np.asarray(size) / np.asarray(seen)
-        places = (maxima + 0.5) * ratio - 0.5
-        if config.corners:
-            places, scores = _with_corners(image, scale, places, scores, config)
-        raw, rows = selected(config, image_size, scale, places, scores, np.ones(len(scores), bool))
-        vectors = _sampled(functional.normalize(descriptors, dim=1), torch.from_numpy((places[rows] + 0.5) / ratio - 0.5), seen, "bicubic")
+        found = corners(normalize_contrast(image), config.corners, config.border) if config.corners else np.empty((0, 2))
+        places, scores = _behind((found + 0.5) * scale / ratio - 0.5, maxima, scores)
+        raw, rows = selected(config, image_size, scale, (places + 0.5) * ratio - 0.5, scores, np.ones(len(scores), bool))
+        vectors = _sampled(functional.normalize(descriptors, dim=1), torch.from_numpy(places[rows]), seen, "bicubic")
         return described(config, stamp_ns, image_size, raw, scores[rows], functional.normalize(vectors, dim=-1).numpy())
 
 
-def _with_corners(
-    image: NDArray[np.uint8], scale: tuple[float, float], places: NDArray[np.float64], scores: NDArray[np.float32], config: ExtractorConfig
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Corners of the image before the detections that are not theirs, all as pixels of the scaled image; every corner has a better score than any detection."""
-    found, _ = corners(normalize_contrast(image), config.corners, config.border)
-    theirs = (found + 0.5) * np.asarray(scale) - 0.5
-    if len(found) and len(places):
-        away = cKDTree(theirs).query(places)[0] > SAME_PX
-        places, scores = places[away], scores[away]
-    order = 1 - np.arange(len(found), dtype=np.float32) / max(2 * len(found), 1)
-    return np.concatenate((theirs, places)), np.concatenate((order, 0.5 * scores / scores.max() if len(scores) else scores))
+def _behind(found: NDArray[np.float64], maxima: NDArray[np.int64], scores: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Corners (C, 2), strongest first, and behind them the detections (N, 2) that are not theirs, all in pixels of what the network saw; with scores: the corners
+    by their order, each better than any detection."""
+    if len(found) == 0:
+        return maxima.astype(np.float64), scores
+    if len(maxima):
+        away = cKDTree(found).query(maxima)[0] > SAME_PX
+        maxima, scores = maxima[away], scores[away]
+    order = 1 - np.arange(len(found), dtype=np.float32) / (2 * len(found))
+    return np.concatenate((found, maxima)), np.concatenate((order, 0.5 * scores / scores.max() if len(scores) else scores))
 
 
 def _network() -> nn.Module:
