@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -44,12 +45,14 @@ class XFeat:
         if runtime != "torch":
             network = Replaced(Compiled(network, "xfeat", OUTPUTS, runtime, torch.get_num_threads()))
         self._network = network
+        self._beside = ThreadPoolExecutor(1, "thegra corners")
 
     @torch.inference_mode()
     def extract(self, image: NDArray[np.uint8], stamp_ns: int) -> Features:
         """See `Extractor.extract`. What is not chosen is not described: it takes as long as all the rest beside the network."""
         config, image_size = self._config, (image.shape[1], image.shape[0])
         scaled, scale = scaled_image(image, config.long_side)
+        beside = self._beside.submit(_corners, image, config)  # it takes a fifth of the network's time
         grey = torch.from_numpy(np.ascontiguousarray(scaled)).to(self._device).float()[None, None] / 255
         size = (scaled.shape[1], scaled.shape[0])
         seen = network_size(size)
@@ -63,11 +66,14 @@ class XFeat:
         strongest = strongest[scores[strongest] > 0]
         maxima, scores = maxima[strongest], scores[strongest]
         ratio = np.asarray(size) / np.asarray(seen)
-        found = corners(normalize_contrast(image), config.corners, config.border) if config.corners else np.empty((0, 2))
-        places, scores = _behind((found + 0.5) * scale / ratio - 0.5, maxima, scores)
+        places, scores = _behind((beside.result() + 0.5) * scale / ratio - 0.5, maxima, scores)
         raw, rows = selected(config, image_size, scale, (places + 0.5) * ratio - 0.5, scores, np.ones(len(scores), bool))
         vectors = _sampled(functional.normalize(descriptors, dim=1), torch.from_numpy(places[rows]), seen, "bicubic")
         return described(config, stamp_ns, image_size, raw, scores[rows], functional.normalize(vectors, dim=-1).numpy())
+
+
+def _corners(image: NDArray[np.uint8], config: ExtractorConfig) -> NDArray[np.float64]:
+    return corners(normalize_contrast(image), config.corners, config.border) if config.corners else np.empty((0, 2))
 
 
 def _behind(found: NDArray[np.float64], maxima: NDArray[np.int64], scores: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
