@@ -70,15 +70,16 @@ sys.exit(supervise([forever, [sys.executable, "-c", "raise SystemExit(7)"]]))
 
 def test_nodes_end_with_whoever_started_them() -> None:
     node = """
-import ctypes
+import ctypes, os
 from thegra_ros.environment import end_with_supervisor
 end_with_supervisor()
-print("computes", flush=True)
+os.write(1, b"computes\\n")  # in one piece, whatever else is written there
 ctypes.PyDLL(None).sleep(10**6)  # and holds Python's lock
 """
     code = "import sys; from thegra_ros.live import supervise; supervise([[sys.executable, '-c', sys.argv[1]]] * 2)"
     with subprocess.Popen([sys.executable, "-c", code, node], stdout=subprocess.PIPE) as parent:
         assert parent.stdout is not None
-        assert [parent.stdout.readline() for _ in range(2)] == [b"computes\n"] * 2
+        heard = [parent.stdout.readline() for _ in range(2)]
         parent.kill()
+        assert heard == [b"computes\n"] * 2
         assert parent.stdout.read() == b"", "both held the other end, and are gone"
