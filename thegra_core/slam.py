@@ -262,7 +262,7 @@ class Slam:
             self._extractor.turns = self._tracking.turns
             self._front_end.forget()
         with self._timed("flow"):
-            followed = self._front_end.follow(image, frame.stamp_ns)
+            followed = self._front_end.follow(image, frame.stamp_ns, self._tracking.expects_detection(frame.stamp_ns))
         with self._timed("mapping"):
             self._take_updates()  # of keyframes that came before: this frame needs their landmarks
             for keyframe in self._tracking.catch_up():

@@ -35,7 +35,7 @@ class DetectEach:
         self._extractor = extractor
         self._last: tuple[Image, int] | None = None
 
-    def follow(self, image: Image, stamp_ns: int) -> Features | None:
+    def follow(self, image: Image, stamp_ns: int, likely: bool = False) -> Features | None:
         """See `FrontEnd.follow`; always None."""
         self._last = image, stamp_ns
         return None
@@ -77,10 +77,10 @@ class DetectAndFollow:
         self._beside = ThreadPoolExecutor(1, "thegra detecting")
         self._early: Future[Features] | None = None
 
-    def follow(self, image: Image, stamp_ns: int) -> Features | None:
+    def follow(self, image: Image, stamp_ns: int, likely: bool = False) -> Features | None:
         """See `FrontEnd.follow`."""
+        self._early = self._detecting(image, stamp_ns) if likely else None
         normalized, before = normalize_contrast(image), self._trail
-        self._early = None
         if before is None or before.normalized.shape != image.shape:
             nothing = _none(stamp_ns, image)
             self._trail = _Trail(image, normalized, nothing, self._anchored(normalized, nothing), 0)
@@ -124,7 +124,7 @@ class DetectAndFollow:
         there, inside = step(*images, points, points + coarse_shift(*images), self._config)
         result, exact, anchors = self._checked(before, normalized, there, inside)
         if len(points) and result.found.mean() < self._config.far_share:
-            self._early = self._detecting(image, stamp_ns)
+            self._early = self._early or self._detecting(image, stamp_ns)
             far = follow_far(*images, points, result, self._config)
             result, exact, anchors = self._checked(before, normalized, far.points, far.found, far)
         chosen = np.flatnonzero(result.found)

@@ -53,8 +53,11 @@ class Wanted(Enum):
 class FrontEnd(Protocol):
     """Makes features of a stream of images."""
 
-    def follow(self, image: NDArray[np.uint8], stamp_ns: int) -> Features | None:
-        """Take the next image (H, W) uint8; keypoints of earlier ones found again in it, None if these are too few, or nothing is ever followed."""
+    def follow(self, image: NDArray[np.uint8], stamp_ns: int, likely: bool = False) -> Features | None:
+        """Take the next image (H, W) uint8; keypoints of earlier ones found again in it, None if these are too few, or nothing is ever followed.
+
+        likely: `detect` will most likely be called for this image: it may begin beside this, and changes nothing of what either returns.
+        """
         ...
 
     def detect(self, wanted: Wanted = Wanted.MORE) -> Features:

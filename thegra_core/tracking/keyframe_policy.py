@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,3 +44,8 @@ def tracked_ratio(place: Place, features: Features, inliers: int) -> float:
         return float(np.isin(tracks, features.track_ids).sum()) / max(len(tracks), 1)
     reference = place.map.keyframes[place.reference_id]
     return inliers / max(int((place.map.landmarks.rows(reference.landmark_ids) >= 0).sum()), 1)
+
+
+def foreseen(ratios: Sequence[float]) -> float:
+    """What comes next after at most two `tracked_ratio` if they go on to change alike; all of it after none."""
+    return 2 * ratios[-1] - ratios[0] if len(ratios) > 1 else ratios[0] if ratios else 1.0

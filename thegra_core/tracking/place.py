@@ -25,6 +25,7 @@ class Place:
     awaited_since_ns: stamp after which frames came while mapping made the map, until they have been looked at. turns: quarter turns counter-clockwise by which
     images are turned before features are looked for in them, so that they lie as the map's first one does. unadjusted_id: the keyframe by which the camera was
     found again, until the map has been adjusted around it; -1 if there is none. due_ns: stamp of the last frame that is to be a keyframe by its followed points.
+    ratios: how much of the last keyframe the last two frames since have seen, see `tracked_ratio`.
     """
 
     map: Map
@@ -44,6 +45,7 @@ class Place:
     turns: int = 0
     unadjusted_id: int = -1
     due_ns: int = -1
+    ratios: tuple[float, ...] = ()
 
     @property
     def begun(self) -> bool:

@@ -31,7 +31,7 @@ from thegra_core.places.index import PlaceIndex
 from thegra_core.process import Submit, call_now
 from thegra_core.tracking.followed import NotPlaced, localize_followed
 from thegra_core.tracking.initializer import Initializer
-from thegra_core.tracking.keyframe_policy import needs_keyframe, tracked_ratio
+from thegra_core.tracking.keyframe_policy import foreseen, needs_keyframe, tracked_ratio
 from thegra_core.tracking.place import Place
 from thegra_core.tracking.relocalizer import doubt_nearby, doubt_of, evidence, last_keyframes, nearest_in_time, relocalize, similar_keyframes
 from thegra_core.tracking.tracker import FrameView, Localization, best_reference, localize
@@ -150,6 +150,17 @@ class TrackingStage:
             if back is not None:
                 return self._go_on_turned(place, back)
         return self._accept(place, features, found, matches)
+
+    def expects_detection(self, stamp_ns: int) -> bool:
+        """Whether a frame of that time, followed keypoints or not, will most likely have to be detected in: where the camera is sought, or a keyframe is due if it
+        goes on as it did."""
+        place = self._place
+        if place is None or not place.begun:
+            return False
+        predicted = place.predict(stamp_ns)
+        if predicted is None:
+            return place.lost_frames > 0
+        return self._may_insert(place) and self._needs_keyframe(place, predicted, foreseen(place.ratios))
 
     def process_followed(self, features: Features, matches: Matches | None) -> TrackingOutput | Wanted:
         """Track one frame by keypoints that were followed to it; `matches` as for `process`.
@@ -394,7 +405,7 @@ class TrackingStage:
             matches, place.take_counts(), place.map.version,
         )  # fmt: skip
         self._next_keyframe_id += 1
-        place.pending[keyframe.id] = keyframe
+        place.pending[keyframe.id], place.ratios = keyframe, ()
         return keyframe
 
     def _may_turn_back(self, place: Place, features: Features, found: Localization) -> bool:
@@ -410,12 +421,20 @@ class TrackingStage:
         return replace(self._accept(place, found.features, found.localization, found.matches), found_turned=found.features)
 
     def _keyframe_due(self, place: Place, features: Features, found: Localization) -> bool:
-        if self.localization_only or len(place.pending) >= self._config.keyframe.most_pending or place.unadjusted_id >= 0:
-            return False  # what hangs on a keyframe that was placed by little would bend the map before that can be set right
+        if not self._may_insert(place):
+            return False
         if place.due_ns == features.stamp_ns:
             return True  # by the followed points, and the image was detected in for it
-        depth = place.map.median_depth(place.reference_id, found.world_from_camera)
-        return bool(needs_keyframe(place.last_keyframe_pose, found.world_from_camera, depth, tracked_ratio(place, features, found.inliers), self._config.keyframe))
+        place.ratios = (*place.ratios[-1:], tracked_ratio(place, features, found.inliers))
+        return self._needs_keyframe(place, found.world_from_camera, place.ratios[-1])
+
+    def _may_insert(self, place: Place) -> bool:
+        """Whether mapping may have one more keyframe: what hangs on one that was placed by little would bend the map before that can be set right."""
+        return not self.localization_only and len(place.pending) < self._config.keyframe.most_pending and place.unadjusted_id < 0
+
+    def _needs_keyframe(self, place: Place, world_from_camera: FloatArray, tracked_ratio: float) -> bool:
+        depth = place.map.median_depth(place.reference_id, world_from_camera)
+        return bool(needs_keyframe(place.last_keyframe_pose, world_from_camera, depth, tracked_ratio, self._config.keyframe))
 
     def _recover(self, place: Place, features: Features, matches: Matches, reason: str, turned: Turned | None) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
