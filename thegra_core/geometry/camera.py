@@ -76,6 +76,10 @@ class CameraModel:
         edge = np.concatenate([np.stack([x, np.full(33, v)], axis=1) for v in (0, height - 1)] + [np.stack([np.full(33, v), y], axis=1) for v in (0, width - 1)])
         return float(np.nanmax(np.linalg.norm(self.undistort(edge), axis=1)))
 
+    @property
+    def _lens(self) -> FloatArray:
+        return np.pad(self.distortion, (0, 8 - len(self.distortion)))
+
     def project(self, points_camera: FloatArray) -> FloatArray:
         """Project points (N, 3) in the camera frame to raw pixels (N, 2); NaN where z <= 0."""
         points = np.asarray(points_camera, dtype=np.float64).reshape(-1, 3)
@@ -106,7 +110,9 @@ class CameraModel:
             return self._undistort_fisheye(target)
         if not np.any(self.distortion):
             return target
-        return self._undistort_newton(target)
+        from thegra_core.geometry import lens  # compiled: only who has pixels waits for the compiler
+
+        return lens.undistort(self._lens, target)
 
     def bearings(self, pixels: FloatArray) -> FloatArray:
         """Unit rays (N, 3) in the camera frame through raw pixels (N, 2)."""
@@ -131,42 +137,9 @@ class CameraModel:
             theta_d = theta * (1 + t2 * (d[0] + t2 * (d[1] + t2 * (d[2] + t2 * d[3]))))
             scale = np.divide(theta_d, r, out=np.ones_like(r), where=r > 1e-12)
             return np.asarray(p * scale[:, None])
-        return self._distort_lens(p)[0]
+        from thegra_core.geometry import lens
 
-    def _distort_lens(self, p: FloatArray) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray]]:
-        """The pinhole models: distorted coordinates (N, 2) and the entries xx, xy = yx and yy, each (N,), of their derivative by the undistorted."""
-        d = self.distortion
-        x, y = p[:, 0], p[:, 1]
-        x2, y2, xy = x * x, y * y, x * y
-        r2 = x2 + y2
-        radial = 1 + r2 * (d[0] + r2 * (d[1] + r2 * d[4]))
-        slope = d[0] + r2 * (2 * d[1] + r2 * 3 * d[4])  # by r2
-        if self.model is DistortionModel.RATIONAL_POLYNOMIAL:
-            below = 1 + r2 * (d[5] + r2 * (d[6] + r2 * d[7]))
-            radial = radial / below
-            slope = (slope - radial * (d[5] + r2 * (2 * d[6] + r2 * 3 * d[7]))) / below
-        distorted = np.stack([x * radial + 2 * d[2] * xy + d[3] * (r2 + 2 * x2), y * radial + d[2] * (r2 + 2 * y2) + 2 * d[3] * xy], axis=1)
-        across = 2 * (slope * xy + d[2] * x + d[3] * y)
-        return distorted, (radial + 2 * slope * x2 + 2 * d[2] * y + 6 * d[3] * x, across, radial + 2 * slope * y2 + 6 * d[2] * y + 2 * d[3] * x)
-
-    def _undistort_newton(self, target: FloatArray) -> FloatArray:
-        p = target.copy()
-        for _ in range(_MAX_ITERATIONS):
-            distorted, (xx, xy, yy) = self._distort_lens(p)
-            residual = distorted - target
-            with np.errstate(divide="ignore", invalid="ignore"):
-                step = np.stack([yy * residual[:, 0] - xy * residual[:, 1], xx * residual[:, 1] - xy * residual[:, 0]], axis=1) / (xx * yy - xy * xy)[:, None]
-            # a damped step keeps strongly distorted corners from jumping over the radius where the model turns back
-            length = np.linalg.norm(step, axis=1, keepdims=True)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                step = np.where(length > 0.3, step * (0.3 / length), step)
-            p = p - step
-            if np.nanmax(np.abs(step), initial=0.0) < _CONVERGED:
-                break
-        with np.errstate(invalid="ignore"):
-            bad = ~(np.linalg.norm(self._distort_normalized(p) - target, axis=1) < 1e-9)
-        p[bad] = np.nan
-        return p
+        return lens.distort(self._lens, np.ascontiguousarray(p))
 
     def _undistort_fisheye(self, target: FloatArray) -> FloatArray:
         d = self.distortion

@@ -103,7 +103,9 @@ def transform(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
 def inverse(a_from_b: FloatArray) -> FloatArray:
     """b_from_a of a rigid transform (4, 4)."""
     rotation = a_from_b[:3, :3].T
-    return transform(rotation, -rotation @ a_from_b[:3, 3])
+    out = np.zeros((4, 4))
+    out[:3, :3], out[:3, 3], out[3, 3] = rotation, -rotation @ a_from_b[:3, 3], 1.0
+    return out
 
 
 def apply(a_from_b: FloatArray, points_b: FloatArray) -> FloatArray:

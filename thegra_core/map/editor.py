@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -266,13 +267,12 @@ class MapEditor:
 
     def observations(self, landmark_ids: IntArray) -> tuple[IntArray, IntArray, IntArray]:
         """All observations of the landmarks: index into `landmark_ids`, keyframe id, keypoint index, (M,) each, in a fixed order."""
-        triples = [
-            (index, keyframe_id, feature)
-            for index, landmark in enumerate(landmark_ids.tolist())
-            for keyframe_id, feature in sorted(self.observers.get(landmark, {}).items())
-        ]
-        table = np.array(triples, dtype=np.int64).reshape(-1, 3)
-        return table[:, 0], table[:, 1], table[:, 2]
+        observed = [self.observers.get(landmark, {}) for landmark in landmark_ids.tolist()]
+        index = np.repeat(np.arange(len(observed)), [len(by) for by in observed])
+        keyframe_ids = np.fromiter(chain.from_iterable(observed), np.int64, len(index))
+        features = np.fromiter(chain.from_iterable(by.values() for by in observed), np.int64, len(index))
+        order = np.lexsort((keyframe_ids, index))
+        return index[order], keyframe_ids[order], features[order]
 
     def shared_landmarks(self, keyframe_id: int) -> Counter[int]:
         """How many landmarks each other keyframe shares with this one."""
@@ -307,10 +307,9 @@ class MapEditor:
         if len(ids) == 0:
             return
         index, keyframe_ids, features = self.observations(ids)
-        seen_by = sorted(set(keyframe_ids.tolist()))
-        position = {keyframe_id: row for row, keyframe_id in enumerate(seen_by)}
-        keyframe_row = np.array([position[i] for i in keyframe_ids.tolist()], dtype=np.int64)
-        centers = np.stack([self.map.keyframes[i].center for i in seen_by]) if seen_by else np.empty((0, 3))
+        seen_by, keyframe_row = np.unique(keyframe_ids, return_inverse=True)
+        keyframes = [self.map.keyframes[i] for i in seen_by.tolist()]
+        centers = np.stack([keyframe.center for keyframe in keyframes]) if keyframes else np.empty((0, 3))
         store = self.map.landmarks
         rows = store.rows(ids)
         rays = store.points_world[rows][index] - centers[keyframe_row]
@@ -320,12 +319,13 @@ class MapEditor:
         depth_min, depth_max = np.full(len(ids), np.inf), np.zeros(len(ids))
         np.minimum.at(depth_min, index, distance)
         np.maximum.at(depth_max, index, distance)
+        newest = np.diff(index, append=-1) != 0  # of a landmark's observations, which come by ascending keyframes
         scores = np.zeros(len(ids))
-        for row, keyframe_id in enumerate(seen_by):
-            mask = keyframe_row == row
-            found = self.map.keyframes[keyframe_id].features
-            np.add.at(scores, index[mask], found.scores[features[mask]])
-            store.column("descriptors")[rows[index[mask]]] = found.descriptors[features[mask]]  # ascending keyframe ids: the newest stays
+        for row, keyframe in enumerate(keyframes):
+            mine = np.flatnonzero(keyframe_row == row)
+            np.add.at(scores, index[mine], keyframe.features.scores[features[mine]])
+            mine = mine[newest[mine]]
+            store.column("descriptors")[rows[index[mine]]] = keyframe.features.descriptors[features[mine]]
         count = np.maximum(np.bincount(index, minlength=len(ids)), 1)
         store.column("normals")[rows] = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
         store.column("depth_min")[rows] = depth_min

@@ -77,14 +77,14 @@ def _adjustment(
     if not free or len(landmarks) == 0:
         return None
     keyframe_ids = np.array([*free, *fixed], dtype=np.int64)
-    row_of = {int(keyframe_id): row for row, keyframe_id in enumerate(keyframe_ids)}
     point, observer, feature = editor.observations(landmarks)
     taking_part = np.isin(observer, keyframe_ids)
     point, observer, feature = point[taking_part], observer[taking_part], feature[taking_part]
-    row = np.array([row_of[i] for i in observer.tolist()], dtype=np.int64)
+    by_id = np.argsort(keyframe_ids)
+    row = by_id[np.searchsorted(keyframe_ids, observer, sorter=by_id)]
     normalized, weights = np.empty((len(point), 2)), np.empty(len(point))
-    for keyframe_id, keyframe_row in row_of.items():
-        mine = row == keyframe_row
+    for keyframe_row, keyframe_id in enumerate(keyframe_ids.tolist()):
+        mine = np.flatnonzero(row == keyframe_row)
         keyframe = editor.map.keyframes[keyframe_id]
         normalized[mine] = keyframe.normalized[feature[mine]]
         weights[mine] = observation_weights(keyframe.features.scores, config.weighting)[feature[mine]]
