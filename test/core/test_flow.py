@@ -147,9 +147,11 @@ class Corners:
 
     def __init__(self) -> None:
         self.calls = 0
+        self.stamps: list[int] = []
 
     def extract(self, image: np.ndarray, stamp_ns: int) -> Features:
         self.calls += 1
+        self.stamps.append(stamp_ns)
         found = cv2.goodFeaturesToTrack(image, 150, 0.01, 8)
         points = np.empty((0, 2), np.float32) if found is None else found[:, 0].astype(np.float32)
         descriptors = np.column_stack((points, np.full(len(points), self.calls))).astype(np.float32)
@@ -192,6 +194,37 @@ def test_detecting_more_keeps_the_tracks_where_they_are() -> None:
     assert (more.descriptors[new, 2] == 2).all(), "what is new comes from this image"
     distance = np.linalg.norm(more.keypoints[new][:, None] - followed.keypoints[None], axis=2).min(axis=1)
     assert (distance > CONFIG.near_px).all()
+
+
+@pytest.mark.parametrize("likely", [False, True])
+def test_a_detection_that_has_begun_is_the_one_that_is_asked_for(likely: bool) -> None:
+    picture, (end, corners) = texture(), front_end()
+    end.follow(view(picture, 0, 0)[0], 0, likely)
+    end.detect()
+    followed = end.follow(view(picture, 4, 1)[0], 1, likely)
+    assert followed is not None
+    more = end.detect(Wanted.MORE)
+    assert corners.calls == 2 and corners.stamps == [0, 1], "each image once"
+    plain, _ = front_end()
+    plain.follow(view(picture, 0, 0)[0], 0)
+    plain.detect()
+    for mine, theirs in ((followed, plain.follow(view(picture, 4, 1)[0], 1)), (more, plain.detect(Wanted.MORE))):
+        assert theirs is not None
+        np.testing.assert_array_equal(mine.keypoints, theirs.keypoints)
+        np.testing.assert_array_equal(mine.track_ids, theirs.track_ids)
+
+
+def test_a_detection_that_nobody_asks_for_changes_nothing() -> None:
+    picture, (end, corners) = texture(), front_end()
+    end.follow(view(picture, 0, 0)[0], 0)
+    first = end.detect()
+    end.follow(view(picture, 4, 1)[0], 1, likely=True)
+    followed = end.follow(view(picture, 8, 2)[0], 2)
+    assert followed is not None
+    pairs = shared_tracks(followed, first)
+    there = first.keypoints[pairs.indices[:, 1]] - [8, 2]
+    assert len(pairs) == len(followed) and np.median(np.linalg.norm(followed.keypoints[pairs.indices[:, 0]] - there, axis=1)) < 0.2
+    assert end.detect(Wanted.MORE).stamp_ns == 2 and corners.stamps == [0, 1, 2]
 
 
 def test_detecting_anew_forgets_the_tracks() -> None:

@@ -49,14 +49,17 @@ class WorldFrontEnd:
         self.last = 0
         self.next = 0
         self.asked: list[Wanted] = []
+        self.detected: list[int] = []
+        self.expected: list[int] = []
         self.misled = False
 
     def seen(self) -> tuple[Features, np.ndarray]:
         found = observe(self.world, self.path[self.last], self.last, self.noise_px)
         return found, (found.descriptors @ self.world.descriptors.T).argmax(axis=1)
 
-    def follow(self, image: np.ndarray, stamp_ns: int) -> Features | None:
+    def follow(self, image: np.ndarray, stamp_ns: int, likely: bool = False) -> Features | None:
         self.last = stamp_ns
+        self.expected += [stamp_ns] * likely
         if not self.known:
             return None
         found, points = self.seen()
@@ -69,6 +72,7 @@ class WorldFrontEnd:
 
     def detect(self, wanted: Wanted = Wanted.MORE) -> Features:
         self.asked.append(wanted)
+        self.detected.append(self.last)
         found, points = self.seen()
         if wanted is Wanted.ANEW:
             self.known = {}
@@ -116,6 +120,25 @@ def test_followed_points_carry_the_camera_along(walked: tuple[list[TrackingResul
     assert len(end.asked) <= keyframes + 3 and Wanted.ANEW not in end.asked
     live, _ = ate(run, WALK, live=True)
     assert live < 0.01
+
+
+def test_a_keyframe_is_mostly_expected_before_its_image_is_looked_at(walked: tuple[list[TrackingResult], Run, WorldFrontEnd, FakeMatcher]) -> None:
+    results, _, end, _ = walked
+    begun = next(r.stamp_ns for r in results if r.is_keyframe)
+    detected, expected = ({s for s in stamps if s > begun} for stamps in (end.detected, end.expected))
+    assert len(detected) > 3
+    assert len(expected & detected) > 0.5 * len(detected), "detection begins beside following"
+    assert len(expected - detected) < 0.5 * len(detected), "and rarely for nothing"
+
+
+def test_a_camera_that_is_lost_is_detected_in() -> None:
+    slam, end, _ = make(WALK)
+    play(slam, 25)
+    end.path = {s: look([500.0, 0, 0], 90) for s in end.path}
+    end.forget()
+    lost = play(slam, 3, 25)
+    assert lost[0].state is not TrackingState.TRACKING
+    assert stamp(27) in end.expected and stamp(27) in end.detected
 
 
 def test_matches_come_from_the_tracks(walked: tuple[list[TrackingResult], Run, WorldFrontEnd, FakeMatcher]) -> None:
@@ -375,7 +398,7 @@ def test_a_keyframe_that_is_due_by_the_followed_points_is_made(monkeypatch: pyte
     """The image has been detected in for it; that more landmarks are found so does not make it needless, for they are not all followed."""
     slam, end, _ = make(WALK)
     play(slam, 25)
-    answers = iter(["due by the followed points"])
+    answers = iter(["", "due by the followed points"])  # it was not expected
     monkeypatch.setattr("thegra_core.tracking.stage.needs_keyframe", lambda *_: next(answers, ""))
     assert [r.is_keyframe for r in play(slam, 3, 25)] == [True, False, False]
     assert end.asked[-1] is Wanted.MORE

@@ -7,7 +7,7 @@ import pytest
 
 from thegra_core.config import KeyframeConfig
 from thegra_core.geometry import poses
-from thegra_core.tracking.keyframe_policy import needs_keyframe
+from thegra_core.tracking.keyframe_policy import foreseen, needs_keyframe
 
 CONFIG = KeyframeConfig()
 LAST = poses.transform(poses.so3_exp([0.4, -1.2, 0.3]), [3.0, -2.0, 7.0])
@@ -40,3 +40,8 @@ def test_few_tracked_landmarks_unless_switched_off() -> None:
     assert asked(np.eye(4), tracked=0.5) == ""
     assert asked(np.eye(4), tracked=0.4999) == "few landmarks tracked"
     assert asked(np.eye(4), tracked=0.0, config=KeyframeConfig(min_tracked_ratio=0.0)) == ""
+
+
+@pytest.mark.parametrize(("ratios", "next_one"), [((), 1.0), ((0.8,), 0.8), ((0.8, 0.7), 0.6), ((0.6, 0.6), 0.6)])
+def test_what_is_seen_of_a_keyframe_goes_on_to_change_alike(ratios: tuple[float, ...], next_one: float) -> None:
+    assert foreseen(ratios) == pytest.approx(next_one)

@@ -204,6 +204,10 @@ class Editing(RuleBasedStateMachine):
         np.testing.assert_array_equal(editor.map.landmarks.alive_ids(), sorted(editor.observers))
         assert set(editor.first_keyframe) == set(editor.observers)
         assert {i for i, n in editor.visible.items() if n} <= set(editor.observers)
+        asked = np.array([*sorted(editor.observers, reverse=True), 10**6], np.int64)
+        table = np.stack(editor.observations(asked), axis=1)
+        in_order = [(row, i, feature) for row, landmark in enumerate(asked.tolist()) for i, feature in sorted(editor.observers.get(landmark, {}).items())]
+        assert table.tolist() == [list(triple) for triple in in_order]
 
 
 TestEditing = Editing.TestCase
