@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from thegra_core.geometry import poses
-from thegra_core.geometry.triangulation import depths, parallax, refine_points, reprojection_errors, triangulate, triangulate_views
+from thegra_core.geometry.refinement import refine_points
+from thegra_core.geometry.triangulation import depths, parallax, reprojection_errors, triangulate, triangulate_views
 
 
 def test_a_point_by_hand() -> None:

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from thegra_core.geometry import poses
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 def triangulate(camera0_from_world: FloatArray, camera1_from_world: FloatArray, normalized0: FloatArray, normalized1: FloatArray) -> FloatArray:
@@ -34,38 +33,6 @@ def triangulate_views(camera_from_world: FloatArray, normalized: FloatArray) -> 
     points = np.full((len(normalized), 3), np.nan)
     points[good] = np.linalg.solve(normal[good], right[good][..., None])[..., 0]
     return points
-
-
-def refine_points(
-    camera_from_world: FloatArray, normalized: FloatArray, point_index: IntArray, points_world: FloatArray, steps: int = 5
-) -> tuple[FloatArray, FloatArray]:
-    """Points (P, 3) moved to the least squared reprojection error by Gauss-Newton, and the error (M,) of each observation on the plane z = 1.
-
-    camera_from_world (M, 4, 4) and normalized (M, 2) belong to the M observations, point_index (M,) names the point each sees. A point that a step would
-    put behind one of its cameras stays where it is.
-    """
-    rotation, translation = camera_from_world[:, :3, :3], camera_from_world[:, :3, 3]
-    points = points_world.copy()
-
-    def residuals(candidate: FloatArray) -> tuple[FloatArray, FloatArray]:
-        seen = np.einsum("mij,mj->mi", rotation, candidate[point_index]) + translation
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return seen, seen[:, :2] / seen[:, 2:] - normalized
-
-    for _ in range(steps):
-        seen, error = residuals(points)
-        z = np.where(seen[:, 2] > 1e-9, seen[:, 2], np.inf)  # no pull from behind a camera
-        rows = (rotation[:, :2] - (seen[:, :2] / z[:, None])[..., None] * rotation[:, 2:3]) / z[:, None, None]
-        error = np.where(np.isfinite(z)[:, None], error, 0.0)
-        normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-        np.add.at(normal, point_index, np.einsum("mri,mrj->mij", rows, rows))
-        np.add.at(right, point_index, np.einsum("mri,mr->mi", rows, error))
-        normal += 1e-9 * np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-12)[:, None, None] * np.eye(3)
-        moved = points - np.linalg.solve(normal, right[..., None])[..., 0]
-        behind = np.bincount(point_index, weights=residuals(moved)[0][:, 2] <= 1e-9, minlength=len(points)) > 0
-        points = np.where(behind[:, None], points, moved)
-    seen, error = residuals(points)
-    return points, np.where(seen[:, 2] > 0, np.linalg.norm(error, axis=1), np.inf)
 
 
 def depths(camera_from_world: FloatArray, points_world: FloatArray) -> FloatArray:

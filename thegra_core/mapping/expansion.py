@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from thegra_core.config import MappingConfig
 from thegra_core.geometry import epipolar, triangulation
+from thegra_core.geometry.refinement import refine_points
 from thegra_core.map.editor import MapEditor
 from thegra_core.map.map import MapKeyframe
 from thegra_core.messages import NO_LANDMARK, Matches
@@ -108,7 +109,7 @@ def _join_anew(editor: MapEditor, landmarks: list[int], other: MapKeyframe, feat
     if not pairs:
         return
     start = editor.map.landmarks.points_world[editor.map.landmarks.rows(np.array([landmark for landmark, _ in pairs]))]
-    points, errors = triangulation.refine_points(np.stack(views), np.stack(normalized), np.array(index), start)
+    points, errors = refine_points(np.stack(views), np.stack(normalized), np.array(index), start)
     worst = np.zeros(len(pairs))
     np.maximum.at(worst, index, editor.map.camera.focal * errors)
     touched: set[int] = set()
