@@ -133,6 +133,7 @@ class Slam:
         self._front_end.follow(self._preprocessing.warm_up(noise), 0)
         features = self._front_end.detect()
         self._front_end.forget()
+        self._camera.undistort(features.keypoints.astype(np.float64))
         for matcher in filter(None, (self._matcher, self._thorough)):
             matcher.match(features, features)
         self._mapping.usage()

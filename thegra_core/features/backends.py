@@ -121,7 +121,7 @@ def _open_onnxruntime(path: Path, threads: int) -> Callable[[NDArray[np.float32]
 def _open_openvino(path: Path, threads: int) -> Callable[[NDArray[np.float32]], Arrays]:
     import openvino
 
-    # its own choice of precision would depend on the processor
+    # its own choice of precision would depend on the processor; pinned, the networks of two processes would share one core
     settings: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": threads, "PERFORMANCE_HINT": "LATENCY", "ENABLE_CPU_PINNING": False}
     model = openvino.Core().compile_model(str(path), "CPU", settings)
     return lambda image: tuple(np.array(value) for value in model([image]).values())

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-MAX_ITERATIONS = 100
-CONVERGED = 1e-12
+_MAX_ITERATIONS = 100
+_CONVERGED = 1e-12
 _LONGEST_STEP = 0.3
 """On the plane z = 1: a damped step keeps strongly distorted corners from jumping over the radius where the model turns back."""
 _compile = numba.njit(cache=True, error_model="numpy")
@@ -42,7 +42,7 @@ def distort(coefficients: FloatArray, normalized: FloatArray) -> FloatArray:
 def undistort(coefficients: FloatArray, distorted: FloatArray) -> FloatArray:
     """Undistorted coordinates (N, 2) of distorted ones (N, 2), by Newton's method on `distort` until all have converged; NaN for those that do not."""
     found = distorted.copy()
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         longest = 0.0
         for n in range(len(distorted)):
             bent_x, bent_y, xx, xy, yy = _bend(coefficients, found[n, 0], found[n, 1])
@@ -55,7 +55,7 @@ def undistort(coefficients: FloatArray, distorted: FloatArray) -> FloatArray:
             found[n, 0] -= step_x
             found[n, 1] -= step_y
             longest = max(longest, abs(step_x), abs(step_y)) if length == length else longest
-        if longest < CONVERGED:
+        if longest < _CONVERGED:
             break
     for n in range(len(distorted)):
         bent_x, bent_y, _, _, _ = _bend(coefficients, found[n, 0], found[n, 1])

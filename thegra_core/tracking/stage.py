@@ -33,7 +33,8 @@ from thegra_core.tracking.followed import NotPlaced, localize_followed
 from thegra_core.tracking.initializer import Initializer
 from thegra_core.tracking.keyframe_policy import foreseen, needs_keyframe, tracked_ratio
 from thegra_core.tracking.place import Place
-from thegra_core.tracking.relocalizer import doubt_nearby, doubt_of, evidence, last_keyframes, nearest_in_time, relocalize, similar_keyframes
+from thegra_core.tracking.relocalizer import doubt_nearby, doubt_of, evidence, nearest_in_time, relocalize
+from thegra_core.tracking.seeking import Seeker
 from thegra_core.tracking.tracker import FrameView, Localization, best_reference, localize
 from thegra_core.tracking.turning import FoundTurned, Turned, turn_back
 
@@ -82,7 +83,7 @@ class TrackingStage:
         self._camera = camera
         self._config = config
         self._matcher = matcher
-        self._thorough = thorough
+        self._seeker = Seeker(matcher, thorough, config)
         self._initializer = Initializer(camera, config, matcher, submit)
         self._place: Place | None = None
         self._before: Place | None = None
@@ -146,7 +147,7 @@ class TrackingStage:
         if isinstance(found, str):
             return self._recover(place, features, matches, found, turned)
         if self._may_turn_back(place, features, found) and turned is not None:
-            back = turn_back(place.map, place.reference_id, found, place.turns, turned, self._thorough or self._matcher, self._config)
+            back = turn_back(place.map, place.reference_id, found, place.turns, turned, self._seeker.thorough or self._matcher, self._config)
             if back is not None:
                 return self._go_on_turned(place, back)
         return self._accept(place, features, found, matches)
@@ -443,7 +444,7 @@ class TrackingStage:
             logger.info("map %s did not stand its probation: %s", dropped, reason)
             output = self._start(features, None) if self._place is None else self._stay_lost(self._place, features, reason)
             return replace(output, dropped_map_id=dropped)
-        found = self._seek(place, features, matches)
+        found = self._seeker.seek(place, features, matches)
         if found is not None:
             place.reference_id = found[1]
             return self._accept(place, features, found[0], found[2], sought=True)
@@ -451,7 +452,7 @@ class TrackingStage:
         for degrees in rotations:
             assert turned is not None
             other = turned((place.turns + degrees // 90) % 4)
-            found = self._seek(place, other, self._matcher.match(other, place.reference))
+            found = self._seeker.seek(place, other, self._matcher.match(other, place.reference))
             if found is not None:
                 return self._go_on_turned(place, FoundTurned(other, *found))
         if place.search_frames:
@@ -460,30 +461,6 @@ class TrackingStage:
             result = TrackingResult(features.stamp_ns, TrackingState.RELOCALIZING, keypoints=len(features), map_id=place.map.map_id, reason=reason)
             return TrackingOutput(result)
         return self._stay_lost(place, features, reason)
-
-    def _seek(self, place: Place, features: Features, matches: Matches) -> tuple[Localization, int, Matches] | None:
-        """Match a frame to the last keyframes or, once it is lost, to those that look most alike; `matches` are to the reference."""
-        settings = self._config.relocalization
-        nearby = place.lost_frames == 0
-        if nearby:
-            candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
-        else:
-            candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
-        if self._thorough is not None:
-            return self._seek_thoroughly(place, features, [place.reference_id, *candidates][: settings.keyframes], self._thorough, nearby)
-        return relocalize(place.map, features, candidates, self._matcher, self._config, nearby, {place.reference_id: matches})
-
-    def _seek_thoroughly(
-        self, place: Place, features: Features, candidates: list[int], matcher: Matcher, nearby: bool
-    ) -> tuple[Localization, int, Matches] | None:
-        """Match a frame to the candidates; where the camera was just now to the first, and to the others only if that one is not enough: a slow matcher costs frames
-        of a live camera. What may be anywhere is worth the matches to all."""
-        first = {candidates[0]: matcher.match(features, place.map.keyframes[candidates[0]].features)}
-        for others in ([], candidates[1:]) if nearby else (candidates[1:],):
-            found = relocalize(place.map, features, others, matcher, self._config, nearby, first)
-            if found is not None:
-                return found
-        return None
 
     def _stay_lost(self, place: Place, features: Features, reason: str) -> TrackingOutput:
         if place.lost_frames == 0:

@@ -1,0 +1,45 @@
+"""Where a camera may be that tracking could not place: the last keyframes, or once it is lost those of the whole map that look alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from thegra_core.config import ThegraConfig
+from thegra_core.features.protocols import Matcher
+from thegra_core.messages import Features, Matches
+from thegra_core.tracking.place import Place
+from thegra_core.tracking.relocalizer import last_keyframes, relocalize, similar_keyframes
+from thegra_core.tracking.tracker import Localization
+
+
+@dataclass(frozen=True, slots=True)
+class Seeker:
+    """Places frames by matching them to keyframes; by `thorough`, a slower matcher that finds more, where there is one."""
+
+    matcher: Matcher
+    thorough: Matcher | None
+    config: ThegraConfig
+
+    def seek(self, place: Place, features: Features, matches: Matches) -> tuple[Localization, int, Matches] | None:
+        """The frame's place, the keyframe by which it was found and the matches to that, or None; `matches` are to the reference."""
+        settings = self.config.relocalization
+        nearby = place.lost_frames == 0
+        if nearby:
+            candidates = last_keyframes(place.map, place.reference_id, settings.search_keyframes if place.search_frames else settings.keyframes)
+        else:
+            candidates = similar_keyframes(place.map, place.places, features, place.reference_id, settings.keyframes)
+        if self.thorough is not None:
+            return self._thoroughly(place, features, [place.reference_id, *candidates][: settings.keyframes], self.thorough, nearby)
+        return relocalize(place.map, features, candidates, self.matcher, self.config, nearby, {place.reference_id: matches})
+
+    def _thoroughly(
+        self, place: Place, features: Features, candidates: list[int], matcher: Matcher, nearby: bool
+    ) -> tuple[Localization, int, Matches] | None:
+        """Match a frame to the candidates; where the camera was just now to the first, and to the others only if that one is not enough: a slow matcher costs frames
+        of a live camera. What may be anywhere is worth the matches to all."""
+        first = {candidates[0]: matcher.match(features, place.map.keyframes[candidates[0]].features)}
+        for others in ([], candidates[1:]) if nearby else (candidates[1:],):
+            found = relocalize(place.map, features, others, matcher, self.config, nearby, first)
+            if found is not None:
+                return found
+        return None
