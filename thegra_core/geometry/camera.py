@@ -76,7 +76,7 @@ class CameraModel:
         edge = np.concatenate([np.stack([x, np.full(33, v)], axis=1) for v in (0, height - 1)] + [np.stack([np.full(33, v), y], axis=1) for v in (0, width - 1)])
         return float(np.nanmax(np.linalg.norm(self.undistort(edge), axis=1)))
 
-    @property
+    @cached_property
     def _lens(self) -> FloatArray:
         return np.pad(self.distortion, (0, 8 - len(self.distortion)))
 

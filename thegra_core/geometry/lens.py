@@ -11,10 +11,9 @@ _MAX_ITERATIONS = 100
 _CONVERGED = 1e-12
 _LONGEST_STEP = 0.3
 """On the plane z = 1: a damped step keeps strongly distorted corners from jumping over the radius where the model turns back."""
-_compile = numba.njit(cache=True, error_model="numpy")
 
 
-@_compile
+@numba.njit(cache=True, error_model="numpy")
 def _bend(d: FloatArray, x: float, y: float) -> tuple[float, float, float, float, float]:
     """Distorted coordinates of one point, and the entries xx, xy = yx and yy of their derivative by the undistorted."""
     x2, y2, xy = x * x, y * y, x * y

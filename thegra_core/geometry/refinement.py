@@ -19,8 +19,7 @@ def refine_points(
     camera_from_world (M, 4, 4) and normalized (M, 2) belong to the M observations, point_index (M,) names the point each sees. A point that a step would
     put behind one of its cameras stays where it is.
     """
-    as_given = (np.ascontiguousarray(values, np.float64) for values in (camera_from_world, normalized, points_world))
-    views, pixels, points = as_given
+    views, pixels, points = (np.ascontiguousarray(values, np.float64) for values in (camera_from_world, normalized, points_world))
     moved: tuple[FloatArray, FloatArray] = _refine(views, pixels, np.ascontiguousarray(point_index, np.int64), points, steps)
     return moved
 

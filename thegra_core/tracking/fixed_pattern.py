@@ -58,7 +58,7 @@ class FixedPatternMask:
             self._counts = np.zeros(features.image_size[::-1], np.int16)
         x, y = (coordinate[matches.indices[:, 0]] for coordinate in _pixels(features))
         height, width = self._counts.shape
-        for dy in (-1, 0, 1) if still.any() else ():
+        for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
                 near_y, near_x = np.clip(y[still] + dy, 0, height - 1), np.clip(x[still] + dx, 0, width - 1)
                 self._counts[near_y, near_x] += 1
@@ -78,8 +78,6 @@ def still_in_motion(here: FloatArray, there: FloatArray) -> tuple[BoolArray, Boo
     still, moving = own < STILL_PX, own > MOVING_PX
     if still.mean() > MOST_STILL or moving.sum() < NEIGHBOURS:
         return np.zeros_like(still), np.zeros_like(moving)
-    if not still.any():
-        return still, moving
     _, near = cKDTree(here[moving]).query(here[still], NEIGHBOURS)
     flows = displacement[moving][near]
     middle = np.median(flows, axis=1, keepdims=True)

@@ -433,9 +433,9 @@ class TrackingStage:
         """Whether mapping may have one more keyframe: what hangs on one that was placed by little would bend the map before that can be set right."""
         return not self.localization_only and len(place.pending) < self._config.keyframe.most_pending and place.unadjusted_id < 0
 
-    def _needs_keyframe(self, place: Place, world_from_camera: FloatArray, tracked_ratio: float) -> bool:
+    def _needs_keyframe(self, place: Place, world_from_camera: FloatArray, ratio: float) -> bool:
         depth = place.map.median_depth(place.reference_id, world_from_camera)
-        return bool(needs_keyframe(place.last_keyframe_pose, world_from_camera, depth, tracked_ratio, self._config.keyframe))
+        return bool(needs_keyframe(place.last_keyframe_pose, world_from_camera, depth, ratio, self._config.keyframe))
 
     def _recover(self, place: Place, features: Features, matches: Matches, reason: str, turned: Turned | None) -> TrackingOutput:
         """Tracking failed: drop a map on probation; else the last keyframes, then all that look alike, then a new map beside the old one."""
