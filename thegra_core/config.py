@@ -314,6 +314,7 @@ class BundleConfig(Section):
     full_tolerance: float = Field(1e-5, gt=0, description="the same of the full adjustment")
     huber_px: float = Field(2.447, gt=0, description="px; sqrt(5.991)")
     chi2_px2: float = Field(5.991, gt=0, description="px^2; observations beyond are outliers")
+    landmark_freedom: float = Field(0.0, ge=0, description="degrees of freedom of the Student t distribution by which the errors of a landmark weigh all of its observations; 0: all landmarks alike, as in the paper")
 
 
 class RelocalizationConfig(Section):

@@ -14,6 +14,8 @@ from thegra_core.optimization.solver import BundleTask
 from thegra_core.optimization.weighting import observation_weights
 
 IntArray = NDArray[np.int64]
+FULL_WEIGHINGS = 3
+"""Times that a full adjustment weighs its landmarks anew: a local one does so once, for the next comes soon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +59,7 @@ def adjust_all(editor: MapEditor, config: ThegraConfig) -> None:
 def full_adjustment(editor: MapEditor, config: ThegraConfig) -> Adjustment | None:
     """The map as it is as a full bundle adjustment, in which the first keyframe is held; None if there is nothing to adjust."""
     ids = sorted(editor.map.keyframes)
-    return _adjustment(editor, ids[1:], ids[:1], editor.map.landmarks.alive_ids(), config, config.bundle.full_iterations, config.bundle.full_tolerance)
+    return _adjustment(editor, ids[1:], ids[:1], editor.map.landmarks.alive_ids(), config, config.bundle.full_iterations, config.bundle.full_tolerance, weighings=FULL_WEIGHINGS)
 
 
 def _solve(editor: MapEditor, adjustment: Adjustment | None) -> None:
@@ -72,7 +74,7 @@ def _solve(editor: MapEditor, adjustment: Adjustment | None) -> None:
 
 def _adjustment(
     editor: MapEditor, free: list[int], fixed: list[int], landmarks: IntArray, config: ThegraConfig, iterations: int, tolerance: float,
-    solver: str = "gtsam",
+    solver: str = "gtsam", weighings: int = 1,
 ) -> Adjustment | None:  # fmt: skip
     if not free or len(landmarks) == 0:
         return None
@@ -98,4 +100,4 @@ def _adjustment(
         weights=weights,
         focal=editor.map.camera.focal,
     )
-    return Adjustment(keyframe_ids, landmarks, observer, feature, BundleTask(problem, config.bundle.huber_px, config.bundle.chi2_px2, iterations, tolerance, solver))
+    return Adjustment(keyframe_ids, landmarks, observer, feature, BundleTask(problem, config.bundle.huber_px, config.bundle.chi2_px2, iterations, tolerance, solver, config.bundle.landmark_freedom, weighings))

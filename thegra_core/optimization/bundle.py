@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from thegra_core.geometry import poses
 from thegra_core.optimization.factor_graph import FactorGraph
 from thegra_core.optimization.schur import SchurSystem
 from thegra_core.optimization.undetermined import undetermined
+from thegra_core.optimization.weighting import landmark_weights
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -66,23 +67,30 @@ MINIMIZERS: dict[str, Callable[[BundleProblem, float], Minimizer]] = {"gtsam": F
 
 
 def bundle_adjust(
-    problem: BundleProblem, huber_px: float, chi2_px2: float, iterations: int, tolerance: float = 1e-5, solver: str = "gtsam"
+    problem: BundleProblem, huber_px: float, chi2_px2: float, iterations: int, tolerance: float = 1e-5, solver: str = "gtsam", freedom: float = 0.0, weighings: int = 1
 ) -> BundleResult:
-    """Minimise Huber(e^T Omega e) over poses and points in two stages; outliers are left out of the second and marked again at the end. Points that their views do
+    """Minimise Huber(e^T Omega e) over poses and points in stages; outliers are left out of the next and marked again at the end. Points that their views do
     not tell take no part: those views may be a few of many.
 
-    A stage ends after `iterations` steps (the first after half of them), or when a step lessens the cost by less than its share `tolerance`.
+    A stage ends after `iterations` steps (the first after half of them), or when a step lessens the cost by less than its share `tolerance`. After the first,
+    `weighings` follow, each with the points weighed by what the last left of their errors, see `landmark_weights`.
 
+    freedom: That of `landmark_weights`; with 0 all points count alike and one stage follows.
     solver: One of `MINIMIZERS`. A solve that is given up (an indeterminate system) returns the problem's own poses and points.
     """
     used = ~_outliers(problem, problem.world_from_camera, problem.points_world, _gross(problem, chi2_px2))
     camera, points = problem.world_from_camera, problem.points_world
     minimizer = MINIMIZERS[solver](problem, huber_px)
-    for stage_iterations in (max(iterations // 2, 1), iterations):
-        camera, points = _solve(problem, minimizer, camera, points, used, stage_iterations, tolerance)
-        used = ~_outliers(problem, camera, points, chi2_px2)
+    camera, points = _solve(problem, minimizer, camera, points, used, max(iterations // 2, 1), tolerance)
+    for _ in range(weighings if freedom else 1):
+        errors = squared_errors(problem, camera, points)
+        used = errors < chi2_px2
+        if freedom:
+            weights = problem.weights * landmark_weights(errors, problem.point_index, used, len(points), freedom)
+            minimizer = MINIMIZERS[solver](replace(problem, weights=weights), huber_px)
+        camera, points = _solve(problem, minimizer, camera, points, used, iterations, tolerance)
     errors = squared_errors(problem, camera, points)
-    return BundleResult(camera, points, ~used, errors)
+    return BundleResult(camera, points, ~(errors < chi2_px2), errors)
 
 
 def squared_errors(problem: BundleProblem, world_from_camera: FloatArray, points_world: FloatArray) -> FloatArray:

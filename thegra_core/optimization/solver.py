@@ -26,10 +26,12 @@ class BundleTask:
     iterations: int
     tolerance: float
     solver: str = "gtsam"
+    freedom: float = 0.0
+    weighings: int = 1
 
     def solve(self) -> BundleResult:
         """The adjustment, in this thread."""
-        return bundle_adjust(self.problem, self.huber_px, self.chi2_px2, self.iterations, self.tolerance, self.solver)
+        return bundle_adjust(self.problem, self.huber_px, self.chi2_px2, self.iterations, self.tolerance, self.solver, self.freedom, self.weighings)
 
 
 class PendingBundle(Protocol):

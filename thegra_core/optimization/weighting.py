@@ -28,3 +28,23 @@ def observation_weights(scores: NDArray[np.float32], weighting: str) -> FloatArr
     median = float(np.median(values))
     relative = values / median if median > 0 else np.ones_like(values)
     return np.asarray(np.clip(relative, MIN_RELATIVE_SCORE, MAX_RELATIVE_SCORE) ** 2)
+
+
+def landmark_weights(squared_errors: FloatArray, landmarks: NDArray[np.int64], used: NDArray[np.bool_], count: int, freedom: float) -> FloatArray:
+    """Factors (M,) on the weights of observations: those of a landmark whose errors are large count less, all alike.
+
+    What is followed does not err anew in each image: where a square slides along an edge, or lies across one, it is off by much the same in many, and one such
+    landmark bends the map more than as many single errors would. Each landmark's errors are taken for normal with a variance of its own, the inverse of which
+    is gamma distributed about that of the median landmark: together they follow a multivariate Student t distribution (Lange, Little and Taylor 1989), and
+    these are the weights of its maximum likelihood by iterated least squares.
+
+    squared_errors (M,) px^2, of landmark `landmarks` (M,) of `count`; only those `used` (M,) tell its variance. freedom: degrees of freedom; the more, the more
+    alike the factors.
+    """
+    dimensions = 2 * np.bincount(landmarks[used], minlength=count)
+    sums = np.bincount(landmarks[used], squared_errors[used], minlength=count)
+    seen = dimensions > 0
+    ordinary = float(np.median(sums[seen] / dimensions[seen])) if np.any(seen) else 0.0
+    if ordinary <= 0:
+        return np.ones(len(landmarks))
+    return np.asarray(((freedom + dimensions) / (freedom + sums / ordinary))[landmarks])
