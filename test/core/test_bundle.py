@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,8 +23,8 @@ def solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     return str(request.param)
 
 
-def bundle_adjust(task: BundleProblem, huber_px: float, chi2_px2: float, iterations: int) -> BundleResult:
-    return bundle.bundle_adjust(task, huber_px, chi2_px2, iterations, solver=bundle_adjust.solver)  # type: ignore[attr-defined]
+def bundle_adjust(task: BundleProblem, huber_px: float, chi2_px2: float, iterations: int, **settings: Any) -> BundleResult:
+    return bundle.bundle_adjust(task, huber_px, chi2_px2, iterations, solver=bundle_adjust.solver, **settings)  # type: ignore[attr-defined]
 
 
 def problem(seed: int = 0, views: int = 4, count: int = 40, noise_px: float = 0.5, fixed: int = 1, start: float = 0.01, weights: str = "grid") -> BundleProblem:
@@ -266,6 +267,6 @@ def _slide_errors(seed: int) -> list[float]:
     errors = []
     for task in (replace(steady, normalized=steady.normalized + slid), steady):
         for freedom in (0.0, 4.0):
-            found = bundle.bundle_adjust(task, HUBER, 1e6, 30, 1e-6, bundle_adjust.solver, freedom, weighings=3)  # type: ignore[attr-defined]
+            found = bundle_adjust(task, HUBER, 1e6, 30, tolerance=1e-6, freedom=freedom, weighings=3)
             errors.append(float(np.linalg.norm(found.world_from_camera[:, :3, 3] - exact[:, :3, 3])))
     return errors

@@ -100,4 +100,6 @@ def _adjustment(
         weights=weights,
         focal=editor.map.camera.focal,
     )
-    return Adjustment(keyframe_ids, landmarks, observer, feature, BundleTask(problem, config.bundle.huber_px, config.bundle.chi2_px2, iterations, tolerance, solver, config.bundle.landmark_freedom, weighings))
+    bundle = config.bundle
+    task = BundleTask(problem, bundle.huber_px, bundle.chi2_px2, iterations, tolerance, solver, bundle.landmark_freedom, weighings)
+    return Adjustment(keyframe_ids, landmarks, observer, feature, task)

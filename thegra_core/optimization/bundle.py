@@ -78,19 +78,18 @@ def bundle_adjust(
     freedom: That of `landmark_weights`; with 0 all points count alike and one stage follows.
     solver: One of `MINIMIZERS`. A solve that is given up (an indeterminate system) returns the problem's own poses and points.
     """
-    used = ~_outliers(problem, problem.world_from_camera, problem.points_world, _gross(problem, chi2_px2))
     camera, points = problem.world_from_camera, problem.points_world
+    errors = squared_errors(problem, camera, points)
+    used = errors < _gross(errors, chi2_px2)
     minimizer = MINIMIZERS[solver](problem, huber_px)
-    camera, points = _solve(problem, minimizer, camera, points, used, max(iterations // 2, 1), tolerance)
-    for _ in range(weighings if freedom else 1):
-        errors = squared_errors(problem, camera, points)
-        used = errors < chi2_px2
-        if freedom:
+    for stage in range(1 + (weighings if freedom else 1)):
+        if stage and freedom:
             weights = problem.weights * landmark_weights(errors, problem.point_index, used, len(points), freedom)
             minimizer = MINIMIZERS[solver](replace(problem, weights=weights), huber_px)
-        camera, points = _solve(problem, minimizer, camera, points, used, iterations, tolerance)
-    errors = squared_errors(problem, camera, points)
-    return BundleResult(camera, points, ~(errors < chi2_px2), errors)
+        camera, points = _solve(problem, minimizer, camera, points, used, iterations if stage else max(iterations // 2, 1), tolerance)
+        errors = squared_errors(problem, camera, points)
+        used = errors < chi2_px2
+    return BundleResult(camera, points, ~used, errors)
 
 
 def squared_errors(problem: BundleProblem, world_from_camera: FloatArray, points_world: FloatArray) -> FloatArray:
@@ -102,15 +101,9 @@ def squared_errors(problem: BundleProblem, world_from_camera: FloatArray, points
     return np.where(points[:, 2] > 1e-9, errors, np.inf)
 
 
-def _outliers(problem: BundleProblem, world_from_camera: FloatArray, points_world: FloatArray, chi2_px2: float) -> BoolArray:
-    with np.errstate(invalid="ignore"):
-        return ~(squared_errors(problem, world_from_camera, points_world) < chi2_px2)
-
-
-def _gross(problem: BundleProblem, chi2_px2: float) -> float:
+def _gross(errors: FloatArray, chi2_px2: float) -> float:
     """Squared error (px^2) beyond which an observation is left out from the start: Huber's kernel gives each wrong match the pull of a good one, and
     where the baseline is short many of them together bend the scene. Wide enough for a start that is bad as a whole."""
-    errors = squared_errors(problem, problem.world_from_camera, problem.points_world)
     finite = errors[np.isfinite(errors)]
     return max(GROSS * chi2_px2, GROSS * float(np.median(finite))) if len(finite) else np.inf
 

@@ -1,4 +1,4 @@
-"""Observation weights from detection scores (paper Sec. III-D, Eq. 1)."""
+"""Observation weights: from detection scores (paper Sec. III-D, Eq. 1), and from what is left of a landmark's errors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 MIN_RELATIVE_SCORE, MAX_RELATIVE_SCORE = 0.5, 2.0
 """Limits of a score over its keyframe's median: a weight is at most 4 times, at least a quarter of, the ordinary one."""
@@ -30,7 +32,7 @@ def observation_weights(scores: NDArray[np.float32], weighting: str) -> FloatArr
     return np.asarray(np.clip(relative, MIN_RELATIVE_SCORE, MAX_RELATIVE_SCORE) ** 2)
 
 
-def landmark_weights(squared_errors: FloatArray, landmarks: NDArray[np.int64], used: NDArray[np.bool_], count: int, freedom: float) -> FloatArray:
+def landmark_weights(squared_errors: FloatArray, landmarks: IntArray, used: BoolArray, count: int, freedom: float) -> FloatArray:
     """Factors (M,) on the weights of observations: those of a landmark whose errors are large count less, all alike.
 
     What is followed does not err anew in each image: where a square slides along an edge, or lies across one, it is off by much the same in many, and one such
