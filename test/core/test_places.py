@@ -158,6 +158,25 @@ def test_a_few_agreeing_landmarks_of_many_that_should_be_seen_are_no_place():
     assert isinstance(told, str) and "should be seen from there" in told
 
 
+def test_no_network_is_asked_about_what_has_other_descriptors():
+    editor, _ = place_map()
+    screened = CONFIG.model_copy(update={"loop": CONFIG.loop.model_copy(update={"min_nearest": 10})})
+    elsewhere = observe(make_world(WORLD.points, seed=99), look((0, 0, 0)), stamp(50))
+    editor.add_keyframe(Keyframe(50, stamp(50), look((0, 0, 0)), elsewhere, np.full(len(elsewhere), NO_LANDMARK, np.int64), -1, 0))
+    matcher = FakeMatcher()
+    assert "clearly nearest" in str(sight(editor.map, 50, editor.map, [0, 1, 2], matcher, screened))
+    assert matcher.calls == 0
+    assert isinstance(sight(editor.map, 10, editor.map, [0, 1, 2], matcher, screened), Sighting)
+    assert matcher.calls == 3
+
+
+def test_neighbours_are_not_matched_where_the_candidate_places_nothing():
+    editor, _ = place_map()
+    matcher = FakeMatcher(wrong=1.0)
+    assert "of the candidate" in str(sight(editor.map, 10, editor.map, [0, 1, 2], matcher, CONFIG))
+    assert matcher.calls == 1
+
+
 def straight_map(count: int, step: float) -> MapEditor:
     editor = MapEditor(0, CAMERA, 15)
     nothing = replace(view(0, 0), keypoints=np.empty((0, 2), np.float32), scores=np.empty(0, np.float32), descriptors=np.empty((0, 32), np.float32))

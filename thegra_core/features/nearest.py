@@ -26,8 +26,8 @@ class Nearest:
         if len(query) == 0 or len(reference) == 0:
             return Matches(query.stamp_ns, reference.stamp_ns, np.empty((0, 2), np.int32), np.empty(0, np.float32))
         distances, largest = _distances(query.descriptors, reference.descriptors)
-        indices = _mutual(distances, self._ratio)
-        confidence = 1 - distances[indices[:, 0], indices[:, 1]] ** (2 if largest is None else 1) / (largest or 2.0)
+        indices, nearest = _mutual(distances, self._ratio)
+        confidence = 1 - nearest ** (2 if largest is None else 1) / (largest or 2.0)
         return Matches(query.stamp_ns, reference.stamp_ns, indices, np.clip(confidence, 0, 1).astype(np.float32))
 
     def match_many(self, query: Features, references: Sequence[Features]) -> list[Matches]:
@@ -42,19 +42,22 @@ def _distances(
     if query.dtype == np.uint8:
         bits = 8.0 * query.shape[1]
         return np.asarray((bits - _signs(query) @ _signs(reference).T) / 2, np.float32), bits
-    cosines = np.asarray(query, np.float32) @ np.asarray(reference, np.float32).T
-    return np.sqrt(np.maximum(2 - 2 * cosines, 0)).astype(np.float32), None
+    products = np.asarray(query, np.float32) @ np.asarray(reference, np.float32).T
+    products *= -2
+    products += 2
+    return np.sqrt(np.maximum(products, 0, out=products), out=products), None
 
 
-def _mutual(distances: NDArray[np.float32], ratio: float) -> NDArray[np.int32]:
-    """(M, 2) pairs that are nearest to each other and clearly nearer than the query's second nearest."""
+def _mutual(distances: NDArray[np.float32], ratio: float) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Pairs (M, 2) that are nearest to each other and clearly nearer than the query's second nearest, and their distances (M,); `distances` are used up."""
     rows = np.arange(len(distances))
     best = distances.argmin(axis=1)
     mutual = distances.argmin(axis=0)[best] == rows
+    nearest = distances[rows, best]
     if distances.shape[1] > 1 and ratio < 1:
-        second = np.partition(distances, 1, axis=1)[:, 1]
-        mutual &= distances[rows, best] < ratio * second
-    return np.stack((rows[mutual], best[mutual]), axis=1).astype(np.int32)
+        distances[rows, best] = np.inf
+        mutual &= nearest < ratio * distances.min(axis=1)
+    return np.stack((rows[mutual], best[mutual]), axis=1).astype(np.int32), nearest[mutual]
 
 
 def _signs(binary: NDArray[np.float32] | NDArray[np.uint8]) -> NDArray[np.float32]:
