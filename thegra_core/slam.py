@@ -134,7 +134,7 @@ class Slam:
         features = self._front_end.detect()
         self._front_end.forget()
         self._camera.undistort(features.keypoints.astype(np.float64))
-        for matcher in filter(None, (self._matcher, self._thorough)):
+        for matcher in (self._matcher, *self._thorough):
             matcher.match(features, features)
         self._mapping.usage()
 

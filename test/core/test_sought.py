@@ -129,7 +129,7 @@ def test_a_frame_after_a_closure_is_found_by_few_landmarks_and_many_matches() ->
     """All but a dozen landmarks are gone, and only the thorough matcher sees anything: the last keyframes, whose poses are known, give the rest."""
     world, path = cloud(count=600, seed=1, low=(-4, -3, 3), high=(8, 3, 8)), sideways(40, 0.05)
     pair = Pair(matcher=(matcher := Sighted()))
-    pair.tracking = TrackingStage(CAMERA, CONFIG, matcher, thorough=FakeMatcher())
+    pair.tracking = TrackingStage(CAMERA, CONFIG, matcher, thorough=[FakeMatcher()])
     pair.run(world, path)
     place = pair.tracking._place
     assert place is not None
@@ -142,13 +142,27 @@ def test_a_frame_after_a_closure_is_found_by_few_landmarks_and_many_matches() ->
     assert result.state is TrackingState.TRACKING and result.inliers < CONFIG.tracking.min_inliers
 
 
-@pytest.mark.parametrize("thorough", [None, FakeMatcher()])
-def test_a_frame_that_the_matcher_does_not_place_is_given_to_the_thorough_one(thorough: FakeMatcher | None) -> None:
+class Counting(Sighted):
+    """Counts how often it is asked."""
+
+    asked = 0
+
+    def match(self, query: Features, reference: Features) -> Matches:
+        self.asked += 1
+        return super().match(query, reference)
+
+
+@pytest.mark.parametrize("blind", [(), (False, False), (True, False), (True, True)])
+def test_a_frame_that_the_matcher_does_not_place_is_given_to_thorough_ones_in_turn(blind: tuple[bool, ...]) -> None:
     world, path = cloud(count=600, seed=1, low=(-4, -3, 3), high=(8, 3, 8)), sideways(40, 0.05)
     pair = Pair(matcher=(matcher := Sighted()))
+    thorough = [Counting() for _ in blind]
     pair.tracking = TrackingStage(CAMERA, CONFIG, matcher, thorough=thorough)
     pair.run(world, path)
     matcher.blind = True
+    for each, sees_nothing in zip(thorough, blind, strict=True):
+        each.blind = sees_nothing
     away = path[28]  # too far from where it would be by now for its landmarks to be sought around their projections
     state = pair.see(observe(world, away, stamp(40), 0.3, 0.9, 10)).result.state
-    assert state is (TrackingState.LOST if thorough is None else TrackingState.TRACKING)
+    assert state is (TrackingState.TRACKING if False in blind else TrackingState.LOST)
+    assert [bool(each.asked) for each in thorough] == [i == 0 or all(blind[:i]) for i in range(len(blind))]

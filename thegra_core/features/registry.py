@@ -81,17 +81,19 @@ def make_frame_matcher(config: ThegraConfig, matcher: Matcher | None = None) -> 
     return TrackMatcher(learned, config.flow.min_shared) if config.flow.enabled else learned
 
 
-def make_tracking_matchers(config: ThegraConfig, matcher: Matcher) -> tuple[Matcher, Matcher | None]:
-    """For tracking: what pairs each frame with its reference, and the thorough one that is asked where that finds too little, if there are to be two."""
+def make_tracking_matchers(config: ThegraConfig, matcher: Matcher) -> tuple[Matcher, tuple[Matcher, ...]]:
+    """For tracking: what pairs each frame with its reference, and what is asked in turn where that finds too little: all keypoints, also those that are not
+    followed, by the first's means, then by the matcher given, if that is another."""
     from thegra_core.features.hurry import Hurried
+    from thegra_core.features.nearest import Nearest
     from thegra_core.features.tracks import TrackMatcher
     from thegra_core.features.turning import TurningMatcher
 
     first = make_first_matcher(config, matcher)
     if config.tracking.match_by != "nearest":
-        return first, None
+        return first, ()
     hurried = Hurried(matcher, most_threads()) if config.threads else matcher
-    return first, TrackMatcher(TurningMatcher(hurried), None)
+    return first, tuple(TrackMatcher(TurningMatcher(each), None) for each in (Nearest(config.matcher), hurried))
 
 
 def make_first_matcher(config: ThegraConfig, matcher: Matcher | None = None) -> Matcher:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -76,10 +77,10 @@ class TrackingStage:
     """State of tracking: the place in the current map, the map before it while a new one is on probation, and the search for a first map.
 
     Call `process` (or `hold`) once a frame, hand what it returns to mapping, and `apply` every update that mapping sends back. What takes long at the start
-    of a map is done by `submit`. Where the matcher finds too little to place a frame, `thorough` may be asked, a slower one that finds more.
+    of a map is done by `submit`. Where the matcher finds too little to place a frame, those of `thorough` are asked in turn, slower ones that find more.
     """
 
-    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher, submit: Submit = call_now, thorough: Matcher | None = None) -> None:
+    def __init__(self, camera: CameraModel, config: ThegraConfig, matcher: Matcher, submit: Submit = call_now, thorough: Sequence[Matcher] = ()) -> None:
         self._camera = camera
         self._config = config
         self._matcher = matcher
@@ -147,7 +148,7 @@ class TrackingStage:
         if isinstance(found, str):
             return self._recover(place, features, matches, found, turned)
         if self._may_turn_back(place, features, found) and turned is not None:
-            back = turn_back(place.map, place.reference_id, found, place.turns, turned, self._seeker.thorough or self._matcher, self._config)
+            back = turn_back(place.map, place.reference_id, found, place.turns, turned, [self._matcher, *self._seeker.thorough][-1], self._config)
             if back is not None:
                 return self._go_on_turned(place, back)
         return self._accept(place, features, found, matches)
