@@ -24,7 +24,7 @@ IntArray = NDArray[np.int64]
 LESS_ALONE = 2.0
 """Times fewer inliers than are asked for with which the candidate alone must place a keyframe, before its neighbours are matched, too. Where 40 are asked for,
 places seen again have 34 to 117 by the candidate alone, what looks alike mostly 5 to 28 (measured)."""
-_CLEARLY_NEAREST = Nearest(MatcherConfig(ratio=0.8))
+_NEAREST = Nearest(MatcherConfig(ratio=0.9))
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +67,10 @@ def sight(new: Map, keyframe_id: int, old: Map, group: list[int], matcher: Match
     settings = config.loop
     keyframe = new.keyframes[keyframe_id]
     candidate = old.keyframes[group[0]].features
-    clear = len(_CLEARLY_NEAREST.match(keyframe.features, candidate)) if settings.min_nearest else 0
-    if clear < settings.min_nearest:
-        return f"{clear} descriptors that are clearly nearest"
+    if settings.min_nearest:
+        cheap = _placed(keyframe, old, {group[0]: _NEAREST.match(keyframe.features, candidate)}, settings.min_nearest, config)
+        if isinstance(cheap, str):
+            return f"{cheap} of the candidate by nearest descriptors"
     first = matcher.match(keyframe.features, candidate)
     if len(first) < settings.min_matches:
         return f"{len(first)} matches"
