@@ -82,8 +82,8 @@ def make_frame_matcher(config: ThegraConfig, matcher: Matcher | None = None) -> 
 
 
 def make_tracking_matchers(config: ThegraConfig, matcher: Matcher) -> tuple[Matcher, tuple[Matcher, ...]]:
-    """For tracking: what pairs each frame with its reference, and what is asked in turn where that finds too little: all keypoints, also those that are not
-    followed, by the first's means, then by the matcher given, if that is another."""
+    """For tracking: what pairs each frame with its reference, and what is asked in turn where that finds too little, if anything is: nearest
+    descriptors of all keypoints, also of those that are not followed, then the matcher given."""
     from thegra_core.features.hurry import Hurried
     from thegra_core.features.nearest import Nearest
     from thegra_core.features.tracks import TrackMatcher
