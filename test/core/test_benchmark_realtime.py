@@ -55,6 +55,26 @@ def test_offline_runs_can_be_left_out(ran: list[tuple[str, str, bool]], tmp_path
     assert content["results"][0]["offline"] is None and realtime.failures(content) == []
 
 
+def test_beside_another_profile(ran: list[tuple[str, str, bool]], tmp_path: Path) -> None:
+    for name in ("hall", "yard"):
+        (tmp_path / name).mkdir()
+    content = realtime.benchmark([tmp_path / "hall", tmp_path / "yard"], ("realtime",), tmp_path / "out", True, ("seed=1",), lambda _: None, "quality")
+    assert ran[-2:] == [("hall", "quality", False), ("yard", "quality", False)]
+    text = (tmp_path / "out" / "results.md").read_text()
+    assert [line.split(" | ")[-1] for line in text.splitlines()[:4]] == ["ATE of quality |", "--- |", "0.011 |", "0.011 |"]
+    assert "ATE of realtime live over that of quality offline: 1.12 (95 %: 1.12 to 1.12), geometric mean of 2 recordings; tracked 97.5 and 97.5 %." in text
+    assert "ATE of realtime offline over that of quality offline: 1.00" in text
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["comparisons"][0]["ratio"] == pytest.approx(0.0123 / 0.011)
+    assert realtime.failures(content) == []
+
+
+def test_what_another_profile_fails_in_is_told(ran: list[tuple[str, str, bool]], tmp_path: Path) -> None:
+    (tmp_path / "hall").mkdir()
+    content = realtime.benchmark([tmp_path / "hall"], ("realtime",), tmp_path / "out", False, (), lambda _: None, "fast")
+    assert content["comparisons"] == []
+    assert realtime.failures(content) == ["hall, fast, offline (exit code 2): no weights"]
+
+
 def test_a_live_run_is_the_command_with_its_option(tmp_path: Path) -> None:
     plan = Plan((tmp_path,), tmp_path / "out", ("realtime",), realtime=True)
     (run,) = planned_runs(plan)

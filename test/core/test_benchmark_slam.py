@@ -243,6 +243,18 @@ def test_a_bag_is_scored_as_the_run_scored_itself(tmp_path: Path) -> None:
     assert (figures["tracked_pct"], figures["ate_rmse"], figures["ate_rel"], figures["truth"]) == (12.5, 0.25, 0.5, "moving")
 
 
+def test_of_a_bag_with_closures_beside_frames_in_them_do_not_count(tmp_path: Path) -> None:
+    bag = simulate(SimulationOptions(duration_s=2.0, rate_hz=5, image_size=(32, 24)), tmp_path / "bag")
+    lines = (bag / "groundtruth.txt").read_text().splitlines()
+    stamps = [frame.stamp_ns for frame in open_recording(bag).frames()]
+    assert len(stamps) == 10
+    (bag / "shutter.txt").write_text(f"{format_stamp(stamps[3] - 1)} {format_stamp(stamps[5] + 1)}\n")
+    truth = "".join(line + "\n" for line in lines if not line.startswith("#"))
+    given = "".join(line + "\n" for i, line in enumerate(truth.splitlines()) if i not in (3, 4, 5, 9))
+    figures = figures_of(planned(bag, run_folder(tmp_path / "out", given)))
+    assert (figures["tracked_pct"], figures["in_closure"], figures["ate_rmse"]) == (pytest.approx(100 * 6 / 7, abs=0.01), 0, pytest.approx(0, abs=1e-6))
+
+
 # ---- summaries --------------------------------------------------------------------------------------------------------------------
 
 
@@ -282,6 +294,20 @@ def test_no_error_is_told_of_a_run_that_tracks_less_than_half() -> None:
 def test_a_recording_whose_runs_all_failed_has_a_row() -> None:
     content = report(Plan((Path("/r/yard"),), Path("/out")), [failed(0)], {})
     assert table(content)[1][0][:3] == ["yard", "fast", "failed"]
+    json.dumps(content, allow_nan=False)
+
+
+def test_profiles_are_compared_with_the_first() -> None:
+    def run(name: str, profile: str, **figures: object) -> RunResult:
+        made = result(0, **figures)
+        return RunResult(PlannedRun(Path("/r") / name, profile, 0, Path("/out"), None), 0, made.figures)
+
+    runs = [run("yard", "quality"), run("yard", "fast", ate_rmse=0.2), run("hall", "quality", ate_rmse=0.2), run("hall", "fast", ate_rmse=0.1, tracked_pct=80.0)]
+    runs += [run("still", profile, truth="still", ate_rmse=None) for profile in ("quality", "fast")]
+    content = report(Plan((Path("/r/yard"), Path("/r/hall")), Path("/out"), ("quality", "fast")), runs)
+    (found,) = content["comparisons"]
+    assert (found["label"], found["against"], found["recordings"], found["ratio"], found["tracked_pct"]) == ("fast", "quality", 2, pytest.approx(1), (90.0, 100.0))
+    assert "ATE of fast over that of quality: 1.00 (95 %: 0.00 to " in markdown(content)
     json.dumps(content, allow_nan=False)
 
 

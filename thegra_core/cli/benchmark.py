@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -98,6 +98,7 @@ def realtime(
     duration: Annotated[float, typer.Option(metavar="S", min=1.0, help="Of the simulated room.")] = 20.0,
     recordings_dir: Annotated[Path, typer.Option(metavar="DIR", help="Where the simulated recordings are kept.")] = Path("runs/realtime"),
     offline: Annotated[bool, typer.Option("--offline/--no-offline", help="Also run each without haste, for the accuracy that haste may cost.")] = True,
+    against: Annotated[str | None, typer.Option(metavar="PROFILE", help="Also run each offline with this profile, without --set, and tell how large the errors are beside its own.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the tables and every run's results. Default: runs/benchmark_TIME.")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter for all runs; repeatable. `thegra config` lists them.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print results.json instead of the table.")] = False,
@@ -124,7 +125,7 @@ def realtime(
             played += logic.simulated_suite(recordings_dir, sizes, rate or (20.0,), say)
         elif not played:
             played = logic.simulated(recordings_dir, sizes, rate or (10.0, 20.0, 30.0), duration, say)
-        content = logic.benchmark(played, tuple(dict.fromkeys(profile or PROFILES)), target, offline, tuple(set_ or ()), status.update)
+        content = logic.benchmark(played, tuple(dict.fromkeys(profile or PROFILES)), target, offline, tuple(set_ or ()), status.update, against)
     print(json.dumps(content, indent=2, allow_nan=False) if as_json else logic.markdown(content))
     for failure in logic.failures(content):
         typer.echo(f"failed: {failure}", err=True)
@@ -297,11 +298,12 @@ def _limits(texts: list[str]) -> dict[str, int]:
     return limits
 
 
-def _show(content: dict[str, object], out: Path, as_json: bool) -> None:
+def _show(content: dict[str, Any], out: Path, as_json: bool) -> None:
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
+    from thegra_core.evaluation.benchmark.comparison import sentences
     from thegra_core.evaluation.benchmark.tables import caption, failures, table
 
     for failure in failures(content):
@@ -317,4 +319,6 @@ def _show(content: dict[str, object], out: Path, as_json: bool) -> None:
         shown.add_row(*map(escape, row))
     console = Console(highlight=False)
     console.print(shown)
+    for sentence in sentences(content["comparisons"]):
+        console.print(sentence, markup=False)
     console.print(f"results  {out / 'results.json'}\ntable    {out / 'results.md'}", soft_wrap=True, markup=False)

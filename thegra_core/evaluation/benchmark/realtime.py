@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from thegra_core.evaluation.benchmark.comparison import Comparison, Scored, compare, sentences
 from thegra_core.evaluation.benchmark.machine import described, machine
 from thegra_core.evaluation.benchmark.slam import Plan, PlannedRun, RunResult, execute, planned_runs, write_report
 from thegra_core.evaluation.suite import SUITE, make_recording
+from thegra_core.outputs.scoring import MIN_COVERAGE_PCT
 from thegra_core.simulation.simulate import SimulationOptions
 from thegra_core.version import VERSION
 
@@ -52,37 +55,70 @@ def simulated_suite(folder: Path, sizes: Sequence[tuple[int, int]], rates: Seque
 
 
 def benchmark(
-    recordings: Sequence[Path], profiles: Sequence[str], out: Path, offline: bool, assignments: tuple[str, ...], say: Callable[[str], None]
+    recordings: Sequence[Path], profiles: Sequence[str], out: Path, offline: bool, assignments: tuple[str, ...], say: Callable[[str], None], against: str | None = None
 ) -> dict[str, Any]:
     """Run everything, one at a time, and write `results.json` and `results.md`; returns what the former holds.
+
+    against: A profile that runs each recording offline, too, without the assignments, for its errors to be compared with.
 
     Raises:
         ThegraError: As `planned_runs`, before anything runs.
     """
     live = Plan(tuple(recordings), out / "live", tuple(profiles), assignments=assignments, realtime=True)
     calm = Plan(tuple(recordings), out / "offline", tuple(profiles), assignments=assignments)
-    content: dict[str, Any] = {"version": VERSION, "machine": machine(), "assignments": list(assignments), "results": []}
+    other = Plan(tuple(recordings), out / "against", (against,) if against is not None else ())
+    content: dict[str, Any] = {"version": VERSION, "machine": machine(), "assignments": list(assignments), "against": against, "results": [], "others": [], "comparisons": []}
+    others = planned_runs(other)
     for run, again in zip(planned_runs(live), planned_runs(calm), strict=True):
         say(f"{run.name} {run.profile} at its own rate")
         played = execute(run, live)
-        result: dict[str, Any] = {"recording": run.name, "profile": run.profile, "live": _figures(played), "offline": None, "failed": _failed(run, played)}
+        result: dict[str, Any] = {"recording": run.name, "profile": run.profile, "live": _figures(played), "offline": None, "failed": _failed(run, "live", played)}
         if offline:
             say(f"{run.name} {run.profile} offline")
             without_haste = execute(again, calm)
-            result |= {"offline": _figures(without_haste), "failed": [*_failed(run, played), *_failed(again, without_haste)]}
+            result["offline"] = _figures(without_haste)
+            result["failed"] += _failed(again, "offline", without_haste)
         content["results"].append(result)
-        write_report(Plan((), out), content, markdown(content))
+        _write(content, out)
+    for run in others:
+        say(f"{run.name} {run.profile} offline, to compare with")
+        done = execute(run, other)
+        content["others"].append({"recording": run.name, "profile": run.profile, "offline": _figures(done), "failed": _failed(run, "offline", done)})
+        _write(content, out)
     return content
+
+
+def _write(content: dict[str, Any], out: Path) -> None:
+    content["comparisons"] = [asdict(c) for c in _comparisons(content)]
+    write_report(Plan((), out), content, markdown(content))
+
+
+def _comparisons(content: Mapping[str, Any]) -> list[Comparison]:
+    """Live maps, and those made without haste, beside the other profile's."""
+    against = f"{content['against']} offline"
+    scored = [_scored(other["recording"], against, other["offline"]) for other in content["others"]]
+    scored += [_scored(r["recording"], f"{r['profile']} {how}", r[how]) for r in content["results"] for how in ("live", "offline")]
+    return compare([s for s in scored if s is not None], against)
+
+
+def _scored(recording: str, label: str, figures: Mapping[str, Any] | None) -> Scored | None:
+    if figures is None:
+        return None
+    told = figures["ate_rmse"] if figures["tracked_pct"] >= MIN_COVERAGE_PCT else None
+    return Scored(recording, label, figures["tracked_pct"], told)
 
 
 def failures(content: Mapping[str, Any]) -> list[str]:
     """One line for each run that failed."""
-    return [line for result in content["results"] for line in result["failed"]]
+    return [line for result in (*content["results"], *content["others"]) for line in result["failed"]]
 
 
 def markdown(content: Mapping[str, Any]) -> str:
     """A GitHub table, a line that explains it, and the failures."""
-    lines = [HEADER, ("---",) * len(HEADER), *(_row(r) for r in content["results"])]
+    header = HEADER if content["against"] is None else (*HEADER, f"ATE of {content['against']}")
+    beside = {other["recording"]: _error(other["offline"], "ate_rmse") for other in content["others"]}
+    rows = [(*_row(r), *([beside.get(r["recording"], "–")] if content["against"] is not None else ())) for r in content["results"]]
+    lines = [header, ("---",) * len(header), *rows]
     text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
     settings = f"With {', '.join(content['assignments'])}. " if content["assignments"] else ""
     told = (
@@ -90,15 +126,15 @@ def markdown(content: Mapping[str, Any]) -> str:
         f"alignment, of the finished map; live: as estimated at the time. "
         f"Thegra {content['version']}, {described(content['machine'])}."
     )
-    return f"{text}\n{told}\n" + "".join(f"\nFailed: {line}\n" for line in failures(content))
+    compared = "".join(f"\n{sentence}\n" for sentence in sentences(content["comparisons"]))
+    return f"{text}\n{told}\n{compared}" + "".join(f"\nFailed: {line}\n" for line in failures(content))
 
 
 def _figures(result: RunResult) -> dict[str, Any] | None:
     return dict(result.figures) if result.figures else None
 
 
-def _failed(run: PlannedRun, result: RunResult) -> list[str]:
-    how = "offline" if "offline" in run.folder.parts else "live"
+def _failed(run: PlannedRun, how: str, result: RunResult) -> list[str]:
     return [] if result.error is None else [f"{run.name}, {run.profile}, {how} (exit code {result.exit_code}): {' '.join(result.error.split())}"]
 
 

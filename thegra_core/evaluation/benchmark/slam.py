@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from thegra_core.config import load_config, parse_assignments
 from thegra_core.errors import InputError
+from thegra_core.evaluation.benchmark.comparison import Comparison, Scored, compare
 from thegra_core.evaluation.benchmark.machine import machine
 from thegra_core.evaluation.benchmark.memory import PeakMemory
 from thegra_core.evaluation.benchmark.peers import best_peer, median_or_none
@@ -190,15 +191,17 @@ def figures_of(run: PlannedRun) -> dict[str, Any]:
 
 
 def _scores(run: PlannedRun, metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """Coverage and errors; over the images of `images.txt` outside the closures of `shutter.txt` where these are, else as the run scored itself."""
+    """Coverage and errors; over the images outside the closures of `shutter.txt` where one of `images.txt` and that is beside them, else as the run scored itself."""
     files = {name: run.recording / f"{name}.txt" for name in ("images", "shutter")}
-    truth_file = open_recording(run.recording).groundtruth
+    recording = open_recording(run.recording)
+    truth_file = recording.groundtruth
     none = {"truth": "none", "tracked_pct": metrics["tracked_pct"], "ate_rmse": None, "ate_rel": None, "in_closure": 0, "spread": None}
-    if not files["images"].is_file() or truth_file is None:
+    if truth_file is None or not any(file.is_file() for file in files.values()):
         truth = read_tum(truth_file) if truth_file is not None else None
         scored = {key: metrics.get(key) for key in ("ate_rmse", "ate_rel", "ate_pct", "ate_live_rmse", "recall_1pct", "rot_deg")}
         return none | scored | ({"truth": _kind(truth), "spread": spread_of(truth.positions)} if truth is not None else {})
-    stamps = read_stamps(files["images"])[: run.max_frames]
+    stamps = read_stamps(files["images"]) if files["images"].is_file() else np.sort(np.array([frame.stamp_ns for frame in recording.frames()], np.int64))
+    stamps = stamps[: run.max_frames]
     truth = within(read_tum(truth_file), stamps)
     closures = read_intervals(files["shutter"]) if files["shutter"].is_file() else ()
     score, live = (score_trajectory(read_tum(run.folder / name), truth, stamps, closures_ns=closures) for name in ("trajectory.txt", "trajectory_live.txt"))
@@ -245,18 +248,26 @@ def summarize(results: Sequence[RunResult]) -> dict[str, Any]:
     return summary
 
 
+def comparisons(summaries: Sequence[Mapping[str, Any]]) -> list[Comparison]:
+    """Each other profile beside the first, by the medians over the seeds, where the ground truth moves."""
+    scored = [Scored(s["recording"], s["profile"], s["tracked_pct"]["median"], s["ate_rmse"]["median"]) for s in summaries if s["truth"] == "moving"]
+    return compare(scored, scored[0].label) if scored else []
+
+
 def report(plan: Plan, results: Sequence[RunResult], peers: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Everything `results.json` holds."""
     groups: dict[tuple[str, str], list[RunResult]] = {}
     for result in results:
         groups.setdefault((result.run.name, result.run.profile), []).append(result)
+    summaries = [summarize(group) for group in groups.values()]
     return {
         "version": VERSION,
         "machine": machine(),
         "runs": plan.runs,
         "workers": plan.workers,
         "assignments": list(plan.assignments),
-        "results": [summarize(group) for group in groups.values()],
+        "results": summaries,
+        "comparisons": [asdict(comparison) for comparison in comparisons(summaries)],
         "peers": {name: best_peer(peers.get(name, {})) for name in dict.fromkeys(name for name, _ in groups)} if peers is not None else {},
     }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from thegra_core.evaluation.benchmark.comparison import sentences
 from thegra_core.evaluation.benchmark.machine import described
 from thegra_core.evaluation.benchmark.peers import PEER_COVERAGE_PCT
 from thegra_core.outputs.scoring import MIN_COVERAGE_PCT
@@ -25,7 +26,8 @@ def markdown(report: Mapping[str, Any]) -> str:
     header, rows = table(report)
     lines = [header, ["---"] * len(header), *rows]
     text = "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in lines)
-    return f"{text}\n{caption(report)}\n" + "".join(f"\nFailed: {failure}\n" for failure in failures(report))
+    compared = "".join(f"\n{sentence}\n" for sentence in sentences(report["comparisons"]))
+    return f"{text}\n{caption(report)}\n{compared}" + "".join(f"\nFailed: {failure}\n" for failure in failures(report))
 
 
 def caption(report: Mapping[str, Any]) -> str:
