@@ -11,7 +11,7 @@ import yaml
 
 from thegra_core.errors import CalibrationError
 from thegra_core.geometry.camera import CameraModel, DistortionModel
-from thegra_core.sources.calibration import camera_from_info, camera_template, check_image_size, load_camera
+from thegra_core.sources.calibration import camera_from_info, camera_template, check_image_size, is_rectified, load_camera
 
 MATRIX = [430.0, 0.0, 322.5, 0.0, 431.0, 251.5, 0.0, 0.0, 1.0]
 ROS = """\
@@ -171,3 +171,17 @@ def test_image_size_is_checked():
     check_image_size(camera, (512, 640))
     with pytest.raises(CalibrationError, match="320x256 but the camera file is for 640x512"):
         check_image_size(camera, (256, 320))
+
+
+def test_a_fisheye_of_orb_slam_has_four_coefficients(tmp_path):
+    numbers = "Camera1.fx: 430.0\nCamera1.fy: 431.0\nCamera1.cx: 322.5\nCamera1.cy: 251.5\nCamera1.k1: 0.01\nCamera1.k2: 0.02\nCamera1.k3: 0.03\nCamera1.k4: 0.04\n"
+    camera = load_camera(write(tmp_path, f'%YAML:1.0\nCamera.type: "KannalaBrandt8"\n{numbers}Camera.width: 640\nCamera.height: 512\n'))
+    assert camera.model is DistortionModel.EQUIDISTANT
+    np.testing.assert_array_equal(camera.distortion, [0.01, 0.02, 0.03, 0.04])
+
+
+@pytest.mark.parametrize(("topic", "rectified"), [
+    ("/cam/image_rect", True), ("/cam/image_rect_color", True), ("/cam/image_rect/compressed", True), ("/cam/image_raw", False), ("/image_rect/raw", False),
+])  # fmt: skip
+def test_topics_of_rectified_images(topic, rectified):
+    assert is_rectified(topic) is rectified

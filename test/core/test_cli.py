@@ -223,6 +223,45 @@ def test_the_wanted_part_is_processed(play, options: list[str], indices: list[in
     assert json.loads((out / "metrics.json").read_text())["frames_total"] == len(indices)
 
 
+@pytest.mark.parametrize(("back", "options", "indices"), [
+    ({0: 3.0}, [], list(range(20))),  # only the first stamp is wrong
+    (dict.fromkeys(range(6, 20), -5.0), [], list(range(20))),  # the clock is set back
+    (dict.fromkeys(range(6, 20), -5.0), ["--start", "0.4"], list(range(4, 20))),
+    ({5: 60.0}, ["--duration", "1.0"], [0, 1, 2, 3, 4, 6, 7, 8, 9]),  # one stamp lies far ahead
+])  # fmt: skip
+def test_frames_with_wrong_stamps_are_not_dropped_in_silence(play, tmp_path: Path, back: dict[int, float], options: list[str], indices: list[int]) -> None:
+    class Wrong(FakeRecording):
+        def frames(self):
+            for frame in FakeRecording.frames(self):
+                yield replace(frame, stamp_ns=frame.stamp_ns + round(back.get(frame.index, 0.0) * 1e9))
+
+    system, seen = FakeSystem(make_run("t" * 20)), []
+    track = system.track
+    system.track = lambda prepared: seen.append(prepared.frame.index) or track(prepared)  # type: ignore[method-assign]
+    play(make_run("t" * 20), *options, recording=Wrong(tmp_path), system=system)
+    assert seen == indices
+
+
+def test_a_map_that_cannot_be_written_costs_no_other_result(play, tmp_path: Path) -> None:
+    class Full(FakeSystem):
+        def save_map(self, path: Path) -> None:
+            raise InputError(f"cannot write {path}: No space left on device")
+
+    result, out = play(make_run(), "--save-map", str(tmp_path / "hall.map"), system=Full(make_run()))
+    assert result.exit_code == 2
+    assert "No space left on device" in result.stderr
+    for name in ("trajectory.txt", "metrics.json", "report.html"):
+        assert (out / name).is_file(), name
+    assert f"{json.loads((out / 'metrics.json').read_text())['tracked_pct']:g} %" in result.stdout
+
+
+def test_a_map_is_no_folder(play, tmp_path: Path) -> None:
+    result, out = play(make_run(), "--save-map", str(tmp_path))
+    assert result.exit_code == 2
+    assert "this is a folder; give the name of a file" in result.stderr
+    assert not out.exists()
+
+
 def test_a_part_without_frames_is_wrong_use(play) -> None:
     result, out = play(make_run(), "--start", "1000")
     assert result.exit_code == 2

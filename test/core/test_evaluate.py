@@ -25,7 +25,7 @@ from thegra_core.evaluation.published import ROVTIO, VIVID
 from thegra_core.evaluation.scores import Settings
 from thegra_core.evaluation.tasks import Outcome, RunTask, execute, finished
 from thegra_core.evaluation.workers import run_tasks
-from thegra_core.outputs.trajectory import format_tum, read_tum
+from thegra_core.outputs.trajectory import Trajectory, format_tum, read_tum
 
 TAU = "/tau_nodelet/thermal_image"
 
@@ -180,6 +180,24 @@ def test_a_reference_that_cannot_be_read_is_told_and_costs_only_the_score(tmp_pa
     (job,) = plan_jobs(replace(plan, found=Found((sequence,))))
     assert job.task.groundtruth is None
     assert job.reference == "no ground truth: the table is torn"
+
+
+def test_a_reference_that_was_corrected_is_read_again(evaluate, tmp_path: Path) -> None:
+    def reference() -> np.ndarray:
+        evaluate("--dataset", "generic", tmp_path / "recordings.yaml", "--dry-run")
+        return read_tum(tmp_path / "out" / "a" / "groundtruth.txt").positions
+
+    write_ros1(tmp_path / "a.bag", thermal(count=5))
+    for name, factor in (("one", 1.0), ("two", 10.0)):
+        poses = walk(5).poses.copy()
+        poses[:, :3, 3] *= factor
+        (tmp_path / f"{name}.txt").write_text(format_tum(Trajectory(walk(5).stamps_ns, poses)))
+    (tmp_path / "recordings.yaml").write_text("- {input: a.bag, groundtruth: one.txt}\n")
+    first = reference()
+    (tmp_path / "recordings.yaml").write_text("- {input: a.bag, groundtruth: two.txt}\n")
+    np.testing.assert_allclose(reference(), 10 * first)  # another table
+    (tmp_path / "two.txt").write_text((tmp_path / "one.txt").read_text() + "# corrected\n")
+    np.testing.assert_allclose(reference(), first)  # the same table, corrected
 
 
 def test_a_camera_that_was_edited_makes_another_task(tmp_path: Path) -> None:

@@ -187,6 +187,14 @@ def test_stretches_cover_the_run_and_leave_gaps() -> None:
     np.testing.assert_allclose([(p.begin_s, p.end_s) for p in parts], [(0, 0.4), (0.4, 0.6), (2.6, 2.8)], atol=1e-9)
 
 
+def test_stamps_that_all_repeat_still_make_a_timeline(tmp_path: Path) -> None:
+    run = make_run("i" * 8, localized=())
+    frames = tuple(replace(f, result=replace(f.result, stamp_ns=BEGIN_NS)) for f in run.frames)
+    (part,) = stretches(replace(run, frames=frames))
+    assert (part.frames, part.begin_s, part.end_s) == (8, 0.0, 1.0)
+    assert "timeline" in _Page(report_of(replace(run, frames=frames), tmp_path)).ids
+
+
 def test_events_are_told_in_order_and_never_too_many() -> None:
     told = events(make_run("iitthhttllttt"))
     assert [e.frame for e in told] == [0, 2, 4, 6, 8, 10]

@@ -10,12 +10,14 @@ import pytest
 from bag_making import (
     COMPRESSED,
     IMAGE,
+    INFO,
     RECEIVED_LATER,
     ROS1,
     ROS2,
     T0,
     compressed_message,
     image_message,
+    info_message,
     infos,
     picture,
     stream,
@@ -145,6 +147,43 @@ def write_mcap(path, store, encoding, count=40, chunk_bytes=4000, profile=""):
 @pytest.mark.parametrize(("store", "encoding"), [(ROS2, "cdr"), (ROS1, "ros1")])
 def test_mcap_written_by_other_tools(tmp_path, store, encoding):
     assert_whole(open_recording(write_mcap(tmp_path / "a.mcap", store, encoding)), 40)
+
+
+def test_messages_of_another_encoding_do_not_end_an_mcap(tmp_path):
+    path = tmp_path / "mixed.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        images = writer.register_channel("/thermal/image_raw", "cdr", writer.register_schema(IMAGE, "ros2msg", b""))
+        log = writer.register_channel("/log", "json", writer.register_schema("foxglove.Log", "jsonschema", b"{}"))
+        writer.add_message(log, T0, b"{}", T0)
+        for i in range(12):
+            stamp = T0 + i * 10**8
+            writer.add_message(images, stamp, bytes(ROS2.serialize_cdr(image_message(ROS2, picture(i), stamp), IMAGE)), stamp)
+            writer.add_message(log, stamp, b"{}", stamp)
+        writer.finish()
+    recording = open_recording(path)
+    assert (recording.frame_count, len(list(recording.frames()))) == (12, 12)
+    assert not any("breaks off" in problem for problem in recording.problems)
+
+
+@pytest.mark.parametrize("topic", ["/thermal/image_rect", "/thermal/image_rect/compressed"])
+@pytest.mark.parametrize("store", [ROS1, ROS2])
+def test_rectified_images_have_the_projection_and_no_distortion(tmp_path, store, topic):
+    info = info_message(store, T0)
+    setattr(info, "P" if store is ROS1 else "p", np.array([80.0, 0, 15, 0, 0, 81, 11, 0, 0, 0, 1, 0]))
+    images = stream(store, 3, topic, compressed_message, COMPRESSED) if topic.endswith("compressed") else stream(store, 3, topic)
+    items = [*images, ("/thermal/camera_info", INFO, info, T0)]
+    recording = open_recording(write_ros1(tmp_path / "a.bag", items) if store is ROS1 else write_ros2(tmp_path / "a", items))
+    assert recording.camera is not None and not recording.camera.distortion.any()
+    np.testing.assert_array_equal(recording.camera.matrix, [[80, 0, 15], [0, 81, 11], [0, 0, 1]])
+    assert "camera from /thermal/camera_info, of rectified images" in recording.notes
+
+
+def test_rectified_images_without_a_projection_have_no_camera(tmp_path):
+    recording = open_recording(write_ros1(tmp_path / "a.bag", [*stream(ROS1, 3, "/thermal/image_rect"), *infos(ROS1)]))
+    assert recording.camera is None
+    assert any("says P = 0" in note for note in recording.notes)
 
 
 @pytest.mark.parametrize("in_folder", [True, False])

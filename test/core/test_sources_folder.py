@@ -139,3 +139,33 @@ def test_damaged_video(tmp_path):
     (tmp_path / "v.mp4").write_bytes(b"nothing")
     with pytest.raises(InputError, match="ffmpeg"):
         open_recording(tmp_path / "v.mp4")
+
+
+def test_a_video_of_16_bits_keeps_them(tmp_path):
+    depth = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
+    writer = cv2.VideoWriter(str(tmp_path / "v.mkv"), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"FFV1"), 25.0, (64, 48), depth)
+    assert writer.isOpened()
+    images = [(22_000 + 7 * i + np.arange(48 * 64).reshape(48, 64)).astype(np.uint16) for i in range(3)]
+    for image in images:
+        writer.write(image)
+    writer.release()
+    level = cv2.utils.logging.getLogLevel()
+    frames = list(open_recording(tmp_path / "v.mkv").frames())
+    np.testing.assert_array_equal([f.image for f in frames], images)
+    assert frames[0].image.dtype == np.uint16 and cv2.utils.logging.getLogLevel() == level
+
+
+@pytest.mark.parametrize("line", ["1.5\ta, b.png", "1.5   a, b.png", "1.5,a, b.png", "1.5 , a, b.png", "\ufeff1.5 a, b.png", "1500000000000000000 a, b.png"])
+def test_lists_of_any_form(tmp_path, line):
+    write_images(tmp_path, ["a, b.png"])
+    (tmp_path / "images.txt").write_text(line + "\n", encoding="utf-8")
+    recording = open_recording(tmp_path)
+    (frame,) = recording.frames()
+    assert frame.stamp_ns in (1_500_000_000, 1_500_000_000 * 10**9) and not recording.problems
+
+
+def test_stamps_that_no_time_can_have_are_told(tmp_path):
+    write_images(tmp_path, ["a.png"])
+    (tmp_path / "images.txt").write_text("1700000000000.0 a.png\n")
+    with pytest.raises(InputError, match="each line must be: seconds"):
+        open_recording(tmp_path)

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from thegra_core.features.protocols import Extractor, Matcher
 
 _log = logging.getLogger(__name__)
+STRAYS = 3
+"""Frames in a row that may be stamped behind the end of the wanted part before it has ended."""
 READ_AHEAD = 2
 """Frames of a recording that are read and pre-processed before they are asked for."""
 
@@ -141,8 +143,8 @@ def run_recording(options: RunOptions) -> int:
             begin = time.perf_counter()
             run = system.finish(progress.stage)
             finish_s = time.perf_counter() - begin
-            if options.save_map is not None and run.maps:
-                system.save_map(options.save_map)
+            if options.save_map is not None:
+                done.error = _save_map(system, options.save_map, run) or done.error
             apart = system.usage()
         timing = Timing(
             wall_s=wall_s, frames_read=done.frames, finish_s=finish_s, dropped_frames=done.dropped, cached_pct=_cached_pct(front_end),
@@ -262,20 +264,38 @@ def _interrupts() -> Iterator[Callable[[], bool]]:
 
 
 def _window(recording: Recording, options: RunOptions) -> Iterator[Frame]:
-    """Frames of the wanted part; the time is counted from the first frame's stamp."""
+    """Frames of the wanted part; the time is counted from the first frame's stamp. Once it has begun, stamps that lie before it are the system's to judge, and only
+    several in a row behind its end are its end: one may be wrong."""
     first: int | None = None
-    given = 0
+    begun, given, behind = False, 0, 0
     for frame in recording.frames():
         first = frame.stamp_ns if first is None else first
         offset_s = (frame.stamp_ns - first) / NS_PER_S
-        if offset_s < options.start_s:
+        begun = begun or offset_s >= options.start_s
+        if not begun:
             continue
         if options.duration_s is not None and offset_s >= options.start_s + options.duration_s:
-            return
+            behind += 1
+            if behind > STRAYS:
+                return
+            continue
+        behind = 0
         yield frame
         given += 1
         if given == options.max_frames:
             return
+
+
+def _save_map(system: System, file: Path, run: Run) -> ThegraError | None:
+    """Why the map is not in the file, None if it is: the other results are written all the same."""
+    if not run.maps:
+        _log.warning("there is no map that could be written to %s", file)
+        return None
+    try:
+        system.save_map(file)
+    except ThegraError as error:
+        return error
+    return None
 
 
 def _expected_frames(options: RunOptions, recording: Recording) -> int | None:
@@ -295,6 +315,8 @@ def _check_options(options: RunOptions) -> None:
         raise InputError("--localization-only needs a map to find the camera in: add --map FILE; a run writes one with --save-map FILE")
     if options.realtime and options.cache is not None:
         raise InputError("--realtime measures what the networks cost: leave --cache out")
+    if options.save_map is not None and options.save_map.is_dir():
+        raise InputError(f"--save-map {options.save_map}: this is a folder; give the name of a file, e.g. --save-map {shlex.quote(str(options.save_map / 'map.thegra'))}")
     if options.save_map is not None and not options.save_map.absolute().parent.is_dir():
         raise InputError(f"--save-map {options.save_map}: the folder is not there; make it with: mkdir -p {shlex.quote(str(options.save_map.parent))}")
 

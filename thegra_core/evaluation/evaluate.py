@@ -133,7 +133,7 @@ def _reference(sequence: DataSequence, folder: Path) -> tuple[Path | None, str]:
     if sequence.reference is None:
         return None, ""
     file, facts = folder / "groundtruth.txt", folder / "groundtruth.json"
-    key = [fingerprint(sequence.recording), *sequence.notes]
+    key = [*map(fingerprint, (sequence.recording, *sequence.reference_files)), *sequence.notes]
     try:
         known = json.loads(facts.read_text(encoding="utf-8"))
         if known["key"] == key and file.is_file():

@@ -44,6 +44,7 @@ class PreprocessingStage:
     """
 
     def __init__(self, config: PreprocessingConfig, image_size: tuple[int, int] | None = None) -> None:
+        self._config = config
         self._chain = Chain(config)
         self._shutter = ShutterDetector(config.shutter)
         self._image_size = image_size
@@ -65,6 +66,9 @@ class PreprocessingStage:
         trouble = self._trouble(frame)
         if trouble:
             return Prepared(frame, trouble)
+        if self._last_stamp_ns is not None and frame.stamp_ns < self._last_stamp_ns:  # another time: nothing before it can be compared with
+            self._shutter = ShutterDetector(self._config.shutter)
+            self._chain.reset()
         self._last_stamp_ns, self._backward = frame.stamp_ns, 0
         begin = time.perf_counter()
         state = self._shutter.update(frame)

@@ -13,7 +13,7 @@ from thegra_core.errors import CalibrationError, InputError
 from thegra_core.messages import Frame, ImageArray
 from thegra_core.sources.bag_files import BagFile, open_bag_files
 from thegra_core.sources.bag_walks import RawMessage
-from thegra_core.sources.calibration import camera_beside, camera_from_info
+from thegra_core.sources.calibration import camera_beside, camera_from_info, is_rectified
 from thegra_core.sources.image_decoding import DecodeError, decode_compressed, decode_raw
 from thegra_core.sources.recording import ImageTopic, Source
 from thegra_core.sources.shutter_flag import FLAG_TYPES, shutter_closed
@@ -205,9 +205,11 @@ def _camera_from_topic(recording: BagRecording, name: str) -> None:
     message = next((m for file in recording.files for m in file.messages(name)), None)
     if message is None:
         return
+    rectified = is_rectified(str(recording.topic))
     try:
-        recording.camera = camera_from_info(message.decode())
-        recording.note(f"camera from {name}" if recording.camera else f"{name} says K = 0: the camera was not calibrated when this was recorded")
+        recording.camera = camera_from_info(message.decode(), rectified)
+        matrix, how = ("P", ", of rectified images") if rectified else ("K", "")
+        recording.note(f"camera from {name}{how}" if recording.camera else f"{name} says {matrix} = 0: the camera was not calibrated when this was recorded")
     except CalibrationError as error:
         recording.note(f"{name} not used: {error}")
     except Exception:  # damaged bytes make the deserialiser raise anything

@@ -86,7 +86,9 @@ def _ros1_records(reader: rosbag1.Reader, file: BinaryIO, types: dict[int, tuple
 
 
 def walk_mcap(path: Path) -> Iterator[RawMessage]:
-    """Messages of an mcap file in the file's order. Raises what the reader raises where the file breaks off."""
+    """Messages of an mcap file in the file's order, without those of other encodings. Raises what the reader raises where the file breaks off, and McapError if
+    all are encoded otherwise."""
+    understood, other = False, ""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     with path.open("rb") as file:
@@ -99,8 +101,12 @@ def walk_mcap(path: Path) -> Iterator[RawMessage]:
                 channel = channels[record.channel_id]
                 kind = schemas[channel.schema_id].name if channel.schema_id in schemas else ""
                 if channel.message_encoding not in ("cdr", "ros1"):
-                    raise McapError(f"messages are encoded as {channel.message_encoding!r}; understood are cdr (ROS 2) and ros1")
+                    other = channel.message_encoding
+                    continue
+                understood = True
                 yield RawMessage(channel.topic, _full_type(kind), record.data, channel.message_encoding == "ros1")
+    if other and not understood:
+        raise McapError(f"messages are encoded as {other!r}; understood are cdr (ROS 2) and ros1")
 
 
 def walk_db3(path: Path) -> Iterator[RawMessage]:

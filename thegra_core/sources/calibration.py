@@ -52,17 +52,29 @@ def load_camera(path: Path | str, camera: str | None = None, image_size: tuple[i
     return _from_matrix_yaml(values, path, image_size)
 
 
-def camera_from_info(info: Any) -> CameraModel | None:
-    """sensor_msgs/CameraInfo (ROS 1 or 2 field names) to a camera; None when its K is all zero, which says: not calibrated.
+def is_rectified(topic: str) -> bool:
+    """Whether an image topic says by its name that its images have been freed of the lens's distortion: `image_rect`, `image_rect_color`, `image_rect/compressed`."""
+    return topic.removesuffix("/compressed").rpartition("/")[2].startswith("image_rect")
+
+
+def camera_from_info(info: Any, rectified: bool = False) -> CameraModel | None:
+    """sensor_msgs/CameraInfo (ROS 1 or 2 field names) to a camera; None when its K (P of rectified images) is all zero, which says: not calibrated.
+
+    Args:
+        rectified: The images are those after rectification: a pinhole with the left of the matrix P, and no distortion (sensor_msgs/CameraInfo).
 
     Raises:
         CalibrationError: If the model is unknown or the numbers are unusable.
     """
-    matrix = np.asarray(getattr(info, "k", None) if hasattr(info, "k") else info.K, dtype=np.float64).reshape(3, 3)
+    if rectified:
+        matrix = np.asarray(getattr(info, "p", None) if hasattr(info, "p") else info.P, dtype=np.float64).reshape(3, 4)[:, :3]
+        distortion, model = np.zeros(5), DistortionModel.PLUMB_BOB
+    else:
+        matrix = np.asarray(getattr(info, "k", None) if hasattr(info, "k") else info.K, dtype=np.float64).reshape(3, 3)
+        distortion = np.asarray(getattr(info, "d", None) if hasattr(info, "d") else info.D, dtype=np.float64)
+        model = _model(str(info.distortion_model), len(distortion), f"camera_info {info.header.frame_id}") if np.any(matrix) else DistortionModel.PLUMB_BOB
     if not np.any(matrix):
         return None
-    distortion = np.asarray(getattr(info, "d", None) if hasattr(info, "d") else info.D, dtype=np.float64)
-    model = _model(str(info.distortion_model), len(distortion), f"camera_info {info.header.frame_id}")
     return CameraModel(matrix, distortion, model, (int(info.width), int(info.height)), str(info.header.frame_id))
 
 
@@ -171,10 +183,11 @@ def _from_matrix_yaml(values: Mapping[str, Any], path: Path, image_size: tuple[i
     matrix = _matrix(*numbers) if len(numbers) == 4 else numbers
     if not any(numbers):
         raise CalibrationError(f"{path}: the camera matrix is all zero, which says that the camera is not calibrated")
-    coefficients = next((flat[key] for key in _DISTORTION_KEYS if key in flat), [flat.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")])
-    distortion = _floats(coefficients, path)
+    named = str(flat.get("distortion_model", flat.get("model", flat.get("type", ""))))
+    single = ("k1", "k2", "k3", "k4") if _model(named, 0, str(path)) is DistortionModel.EQUIDISTANT else ("k1", "k2", "p1", "p2", "k3")
+    distortion = _floats(next((flat[key] for key in _DISTORTION_KEYS if key in flat), [flat.get(key, 0.0) for key in single]), path)
     size = (flat.get("image_width", flat.get("width")), flat.get("image_height", flat.get("height")))
-    model = _model(str(flat.get("distortion_model", flat.get("model", flat.get("type", "")))), len(distortion), str(path))
+    model = _model(named, len(distortion), str(path))
     return _camera(matrix, distortion, model, size if all(size) else image_size, path, str(flat.get("camera_name", "")))
 
 

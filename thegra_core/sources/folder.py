@@ -90,7 +90,7 @@ def parse_stamp(text: str) -> int:
     """Seconds, or nanoseconds when it is a whole number too large for seconds, to nanoseconds, exactly.
 
     Raises:
-        ValueError: If it is no finite number.
+        ValueError: If it is no finite number, or no time that 64 bits of nanoseconds can hold.
     """
     try:
         value = Decimal(text)
@@ -98,7 +98,10 @@ def parse_stamp(text: str) -> int:
         raise ValueError(f"{text!r} is no time stamp") from error
     if not value.is_finite():
         raise ValueError(f"{text!r} is no time stamp")
-    return int(value) if "." not in text and abs(value) > 10**14 else round(value * 10**9)
+    stamp = int(value) if "." not in text and abs(value) > 10**14 else round(value * 10**9)
+    if abs(stamp) >= 2**63:
+        raise ValueError(f"{text!r} is out of range for a time in seconds")
+    return stamp
 
 
 def _with_surroundings(recording: FolderRecording, folders: list[Path]) -> FolderRecording:
@@ -113,17 +116,13 @@ def _with_surroundings(recording: FolderRecording, folders: list[Path]) -> Folde
 def _read_list(file: Path) -> tuple[list[tuple[int, Path]], int]:
     entries: list[tuple[int, Path]] = []
     bad = 0
-    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in file.read_text(encoding="utf-8-sig", errors="replace").splitlines():
         line = line.strip()
         if not line or line.startswith("#"):
             continue
-        stamp, _, name = line.replace(",", " ", 1).partition(" ")
+        stamp, *name = re.split(r"\s*,\s*|\s+", line, maxsplit=1)
         try:
-            entries.append((parse_stamp(stamp), file.parent / name.strip()))
-        except ValueError:
-            bad += 1
-            continue
-        if not name.strip():
-            entries.pop()
+            entries.append((parse_stamp(stamp), file.parent / name[0]))
+        except (ValueError, IndexError):
             bad += 1
     return entries, bad

@@ -14,6 +14,8 @@ from thegra_core.sources.calibration import camera_beside
 from thegra_core.sources.image_decoding import DecodeError, from_array
 from thegra_core.sources.recording import Source
 
+_GRAY16LE = int.from_bytes(b"Y1\x00\x10", "little")
+"""FFmpeg's tag of images of one channel and 16 bits, as FFV1 stores them."""
 SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".mpg", ".mpeg", ".webm", ".ts", ".wmv")
 
 
@@ -26,7 +28,7 @@ class VideoRecording(Source):
     def frames(self) -> Iterator[Frame]:
         """Every frame that can be decoded."""
         self.problems.clear()
-        capture = cv2.VideoCapture(str(self.path))
+        capture = _opened(self.path)
         index = 0
         try:
             while True:
@@ -46,13 +48,26 @@ class VideoRecording(Source):
             self.problems["video frame missing: the file promises more than it holds"] += self.frame_count - index
 
 
+def _opened(path: Path) -> cv2.VideoCapture:
+    """Images of 16 bits as they are stored, which OpenCV would else cut to 8; others as OpenCV converts them."""
+    capture = cv2.VideoCapture(str(path))
+    if int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) != _GRAY16LE:
+        return capture
+    capture.release()
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of formats that this is none of
+    try:
+        return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_CONVERT_RGB, 0])
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
 def open_video(path: Path) -> VideoRecording:
     """Open a video file.
 
     Raises:
         InputError: If OpenCV cannot open it.
     """
-    capture = cv2.VideoCapture(str(path))
+    capture = _opened(path)
     try:
         if not capture.isOpened():
             raise InputError(f"{path} cannot be opened as a video: it is damaged or its codec is unknown here; convert it with: ffmpeg -i {path} images/%06d.png")

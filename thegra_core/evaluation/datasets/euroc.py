@@ -48,7 +48,7 @@ def _sequence(home: Path, options: Options) -> DataSequence:
     truth = next((home / folder / "data.csv" for folder in _TRUTH if (home / folder / "data.csv").is_file()), None)
     reference = None if truth is None else partial(_reference, truth, _body_from_camera(sensor))
     notes = (f"camera {camera}", *(() if truth else (f"no ground truth: none of {', '.join(_TRUTH)}; coverage only",)))
-    return DataSequence(name, recording, None, camera, reference, notes, row=name)
+    return DataSequence(name, recording, None, camera, reference, notes, row=name, reference_files=(truth, cam / "sensor.yaml") if truth else ())
 
 
 def _images(cam: Path) -> list[tuple[int, Path]]:

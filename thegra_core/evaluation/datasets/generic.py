@@ -84,8 +84,9 @@ def _sequence(entry: Entry, base: Path, options: Options) -> DataSequence | Miss
     reference = None
     if truth is not None:
         reference = partial(read_bag_poses, [recording], truth, "topic") if topic else partial(_from_table, base / truth)
-    notes = (f"camera {camera or 'of the recording'}", *(() if truth else ("no ground truth given; coverage only",)))
-    return DataSequence(name, recording, entry.topic, camera, reference, notes, name, entry.start, entry.duration)
+    notes = (f"camera {camera or 'of the recording'}", *((f"reference {truth}",) if truth else ("no ground truth given; coverage only",)))
+    files = () if truth is None or topic else (base / truth,)
+    return DataSequence(name, recording, entry.topic, camera, reference, notes, name, entry.start, entry.duration, files)
 
 
 def _from_table(file: Path) -> Reference:

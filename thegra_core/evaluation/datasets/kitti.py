@@ -47,7 +47,7 @@ def _sequence(home: Path, options: Options) -> DataSequence:
     poses = next((p for p in (home.parent / "poses" / f"{name}.txt", home.parent.parent / "poses" / f"{name}.txt", home / "poses.txt") if p.is_file()), None)
     reference = None if poses is None else partial(_reference, poses, stamps)
     notes = (f"camera {camera}", *(() if poses else (f"no ground truth: no poses/{name}.txt; coverage only",)))
-    return DataSequence(name, recording, None, camera, reference, notes, row=name)
+    return DataSequence(name, recording, None, camera, reference, notes, row=name, reference_files=(poses, home / "times.txt") if poses else ())
 
 
 def _times(file: Path) -> IntArray:

@@ -79,15 +79,22 @@ def _pieces(name: str, bags: list[Path], options: Options) -> list[DataSequence]
     notes = (told, which, f"camera {camera}")
     if options.pieces == "bags":
         # a reference is computed with a delay, so the last poses of a piece may lie in the next bag
-        near = [None if reference is None else partial(reference.func, bags[max(i - 1, 0) : i + 2], *reference.args[1:]) for i in range(len(bags))]
-        return [DataSequence(f"{name}_{i:02d}", bag, topic, camera, near[i], (*notes, f"bag {bag.name}"), row=name) for i, bag in enumerate(bags)]
+        near = [bags[max(i - 1, 0) : i + 2] for i in range(len(bags))]
+        read = [None if reference is None else partial(reference.func, beside, *reference.args[1:]) for beside in near]
+        return [
+            DataSequence(f"{name}_{i:02d}", bag, topic, camera, read[i], (*notes, f"bag {bag.name}"), row=name, reference_files=tuple(near[i]))
+            for i, bag in enumerate(bags)
+        ]
     whole = bags[0] if len(bags) == 1 else linked_bags(options.work / name, bags)
     if options.pieces == "whole":
-        return [DataSequence(name, whole, topic, camera, reference, (*notes, f"{len(bags)} bags as one"), row=name)]
+        return [DataSequence(name, whole, topic, camera, reference, (*notes, f"{len(bags)} bags as one"), row=name, reference_files=tuple(bags))]
     length = _length_s(bags)
     count = max(1, int(length // options.window_s) + (length % options.window_s >= _SHORTEST_S))
     return [
-        DataSequence(f"{name}_{i:02d}", whole, topic, camera, reference, (*notes, f"window of {options.window_s:g} s from {i * options.window_s:g} s"), row=name, start_s=i * options.window_s, duration_s=options.window_s)
+        DataSequence(
+            f"{name}_{i:02d}", whole, topic, camera, reference, (*notes, f"window of {options.window_s:g} s from {i * options.window_s:g} s"), row=name,
+            start_s=i * options.window_s, duration_s=options.window_s, reference_files=tuple(bags),
+        )
         for i in range(count)
     ]
 

@@ -26,7 +26,8 @@ class DataSequence:
     """One run's input.
 
     recording, topic, camera, start_s and duration_s are what `thegra run` takes. `row` is the sequence of the paper's tables that this is (a piece
-    of). `reference` reads the ground truth (it may take a while, and raises InputError); None: there is none. `notes` tell what was decided.
+    of). `reference` reads the ground truth (it may take a while, and raises InputError); None: there is none. `reference_files` are those beside the recording
+    that it reads. `notes` tell what was decided.
     """
 
     name: str
@@ -38,6 +39,7 @@ class DataSequence:
     row: str = ""
     start_s: float = 0.0
     duration_s: float | None = None
+    reference_files: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

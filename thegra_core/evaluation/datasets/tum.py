@@ -33,7 +33,8 @@ def _sequence(home: Path, options: Options) -> DataSequence:
     rig = re.search(r"freiburg([123])", name)
     own = next((home / file for file in BESIDE if (home / file).is_file()), None)
     camera = options.camera or (str(own) if own is not None else camera_preset(f"tum_freiburg{rig[1]}") if rig else None)
-    return DataSequence(name, home, None, camera, partial(_reference, home / "groundtruth.txt"), (f"camera {camera or 'of the recording'}",), row=name)
+    truth = home / "groundtruth.txt"
+    return DataSequence(name, home, None, camera, partial(_reference, truth), (f"camera {camera or 'of the recording'}",), row=name, reference_files=(truth,))
 
 
 def _reference(file: Path) -> Reference:

@@ -99,17 +99,23 @@ def _sequence(name: str, candidates: Sequence[Path], tables: Sequence[Path], cam
     reference = partial(_from_table, table, name) if table is not None else _from_topics(recording)
     if reference is None:
         notes.append(f"no ground truth: neither a topic of poses nor a table like {_gt_name(name)}; coverage only")
-    return DataSequence(name, recording, topic, camera, reference, (told, *notes), row=name)
+    files = () if table is None else (table, *_times_of(table))
+    return DataSequence(name, recording, topic, camera, reference, (told, *notes), row=name, reference_files=files)
 
 
 def _from_table(table: Path, name: str) -> Reference:
-    times = next((f for f in (table.with_name(table.name.replace("_optimized_poses", "_times")), table.with_name(f"{table.stem}_times.txt")) if f.is_file() and f != table), None)
-    read = read_pose_table(table, None if times is None else _stamps(times))
+    read = read_pose_table(table, *map(_stamps, _times_of(table)))
     trajectory, source = read.trajectory, ("LOAM" if name.startswith("outdoor") else "Vicon") + f" table {read.decision}"
     if not name.startswith("outdoor") and spread_of(trajectory.positions) > _MILLIMETRES:
         trajectory = _scaled(trajectory, 1e-3)
         source += "; millimetres by magnitude"
     return Reference(trajectory, source)
+
+
+def _times_of(table: Path) -> tuple[Path, ...]:
+    """The file with the times of a table's lines, if there is one beside it."""
+    named = (table.with_name(table.name.replace("_optimized_poses", "_times")), table.with_name(f"{table.stem}_times.txt"))
+    return tuple(f for f in named if f.is_file() and f != table)[:1]
 
 
 def _from_topics(recording: Path) -> partial[Reference] | None:
@@ -129,7 +135,8 @@ def _post_processed(name: str, folder: Path, notes: list[str], camera: str, opti
     poses = folder / "poses_thermal.txt"
     reference = partial(_from_lines, poses, stamps) if poses.is_file() else None
     notes.append("post-processed release: times are Seoul's" + ("" if reference else "; no poses_thermal.txt, coverage only"))
-    return DataSequence(name, recording, None, camera, reference, tuple(notes), row=name)
+    files = (poses, folder / "Thermal" / "timestamps.txt") if reference else ()
+    return DataSequence(name, recording, None, camera, reference, tuple(notes), row=name, reference_files=files)
 
 
 def _from_lines(poses: Path, stamps: IntArray) -> Reference:

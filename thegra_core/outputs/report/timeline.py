@@ -75,7 +75,7 @@ def stretches(run: Run) -> list[Stretch]:
     if len(frames) == 0:
         return []
     steps = np.diff(times)
-    period = float(np.median(steps)) if len(steps) else 1.0
+    period = (float(np.median(steps)) if len(steps) else 0.0) or 1.0  # 0: most stamps repeat
     lengths = np.append(np.where(steps > _GAP_PERIODS * period, period, steps), period)
     found: list[Stretch] = []
     for i, frame in enumerate(frames):
