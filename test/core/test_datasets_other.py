@@ -11,6 +11,7 @@ from bag_making import T0, write_ros1
 from dataset_making import PERIOD_NS, rows, thermal, transforms, walk
 
 from thegra_core.errors import InputError
+from thegra_core.evaluation.datasets.below import below
 from thegra_core.evaluation.datasets.registry import DATASETS
 from thegra_core.evaluation.datasets.sequence import Found, Options
 from thegra_core.geometry.poses import so3_exp, transform
@@ -153,6 +154,18 @@ def test_a_list_that_is_none_is_refused_with_an_example(tmp_path: Path, text: st
     (tmp_path / "list.yaml").write_text(text)
     with pytest.raises(InputError, match=r"input: flights/one\.bag"):
         find("generic", tmp_path / "list.yaml", tmp_path)
+
+
+def test_data_behind_links_is_found_once(tmp_path: Path) -> None:
+    there = tmp_path / "disk" / "deep"
+    there.mkdir(parents=True)
+    (there / "a.bag").touch()
+    (there / "round").symlink_to(tmp_path / "disk")  # leads back
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "linked").symlink_to(there)
+    (tmp_path / "data" / "again").symlink_to(there)
+    found = [p for p in below([tmp_path / "data"]) if p.name == "a.bag"]
+    assert len(found) == 1 and found[0].resolve() == there / "a.bag"
 
 
 def test_names_must_differ(tmp_path: Path) -> None:

@@ -173,6 +173,11 @@ def test_files_with_lists_of_frames_and_closures(tmp_path: Path) -> None:
     json.dumps(figures, allow_nan=False)
 
 
+def test_lists_of_images_have_seconds_or_nanoseconds(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("1700000000.5 b.png\n1700000000250000000,a.png\n")
+    assert read_stamps(tmp_path / "a.txt").tolist() == [1_700_000_000_250_000_000, 1_700_000_000_500_000_000]
+
+
 def test_bad_lists_are_named_by_line(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("1.0 2.0\nx y\n")
     for read in (read_stamps, read_intervals):

@@ -66,6 +66,13 @@ def test_what_is_there_is_not_overwritten(tmp_path: Path) -> None:
         simulate(SMALL, tmp_path / "out")
 
 
+def test_a_folder_that_cannot_be_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for form in ("mcap", "folder"):
+        with pytest.raises(InputError, match=r"cannot write to .*file: (Not a directory|File exists)"):
+            simulate(SMALL.model_copy(update={"duration_s": 0.1}), tmp_path / "file" / "out", form)
+
+
 def test_progress_counts_to_the_end(tmp_path: Path) -> None:
     calls: list[tuple[int, int]] = []
     simulate(SMALL.model_copy(update={"duration_s": 0.5}), tmp_path / "out", "folder", lambda done, total: calls.append((done, total)))

@@ -145,3 +145,6 @@ def test_wrong_use_says_what_to_type(recording: Path, tmp_path: Path) -> None:
         assert done.exit_code == 2 and message in done.output
     done = CliRunner().invoke(app, ["study", str(recording), "--interval", "60", "--front-end", "ORB", "--out", str(tmp_path / "o")])
     assert done.exit_code == 2 and "thegra info" in done.output
+    (tmp_path / "file").touch()
+    done = CliRunner().invoke(app, ["study", str(recording), "--interval", "60", "--front-end", "ORB", "--out", str(tmp_path / "file")])
+    assert done.exit_code == 2 and f"cannot write to {tmp_path / 'file'}" in done.output, "told before the recording is read"

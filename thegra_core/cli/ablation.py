@@ -11,7 +11,7 @@ from thegra_core.errors import InputError
 from thegra_core.evaluation import ablation as logic
 from thegra_core.evaluation.ablation import AblationPlan, Group, Row
 from thegra_core.evaluation.datasets.sequence import DataSequence
-from thegra_core.outputs.files import write_atomic
+from thegra_core.outputs.files import write_atomic, writing_to
 
 SOME_FAILED = 1
 
@@ -63,14 +63,11 @@ def write(plan: AblationPlan, rows: Sequence[Row]) -> list[Path]:
     """
     from thegra_core.evaluation.ablation_figures import box_plots
 
-    try:
-        plan.out.mkdir(parents=True, exist_ok=True)
+    with writing_to(plan.out):
         files = [write_atomic(plan.out / "ablation.md", logic.markdown(rows, plan)), write_atomic(plan.out / "ablation.csv", logic.to_csv(rows))]
         for group in dict.fromkeys(variant.group for variant in plan.variants):
             mine = [row for row in rows if row.variant.group == group]
             files.append(write_atomic(plan.out / f"{group}.png", box_plots(mine, f"{group}, profile {plan.profile}")))
-    except OSError as error:
-        raise InputError(f"cannot write to {plan.out}: {error.strerror}; choose another folder with --out DIR") from error
     return files
 
 

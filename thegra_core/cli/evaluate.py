@@ -17,7 +17,7 @@ from thegra_core.evaluation.evaluate import Job, Plan, Result, missing_lines, pl
 from thegra_core.evaluation.published import TABLES
 from thegra_core.evaluation.scores import Settings
 from thegra_core.evaluation.tasks import Outcome
-from thegra_core.outputs.files import write_atomic
+from thegra_core.outputs.files import write_atomic, writing_to
 from thegra_core.version import VERSION
 
 SOME_FAILED = 1
@@ -121,14 +121,11 @@ def write(plan: Plan, results: Sequence[Result], notes: dict[str, list[str]], op
         ],
         "notes": notes, "missing": missing, "failed": errors, "caption": caption, "header": header, "cells": cells,
     }  # fmt: skip
-    try:
-        plan.out.mkdir(parents=True, exist_ok=True)
+    with writing_to(plan.out):
         write_atomic(plan.out / "results.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
         write_atomic(plan.out / "results.md", tables.markdown(header, cells, caption, notes, missing, errors))
         write_atomic(plan.out / "table.csv", tables.table_csv(plan.dataset, lines, rows))
         write_atomic(plan.out / "runs.csv", tables.runs_csv(results))
-    except OSError as error:
-        raise InputError(f"cannot write to {plan.out}: {error.strerror}; choose another folder with --out DIR") from error
     return content
 
 

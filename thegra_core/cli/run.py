@@ -21,6 +21,7 @@ from thegra_core.config import ThegraConfig, load_config, parse_assignments
 from thegra_core.errors import InputError, ThegraError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Frame, MapSummary, Run, Snapshot, TrackingResult
+from thegra_core.outputs.files import writing_to
 from thegra_core.outputs.metrics import Timing
 from thegra_core.outputs.trajectory import NS_PER_S, read_tum
 from thegra_core.outputs.viewer import Viewer, make_viewer
@@ -357,11 +358,8 @@ def log_file(out: Path) -> Iterator[None]:
         InputError: If it cannot be written.
     """
     logger = logging.getLogger("thegra_core")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with writing_to(out):
         handler = logging.FileHandler(out / "thegra.log", mode="w", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"cannot write to {out}: {error.strerror}; choose another folder with --out DIR") from error
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
     level = logger.level
     logger.setLevel(logging.INFO)

@@ -14,7 +14,7 @@ from thegra_core.evaluation.datasets.sequence import DataSequence, Found, Missin
 from thegra_core.evaluation.scores import Settings, score_fitted
 from thegra_core.evaluation.tasks import Outcome, RunTask, fingerprint
 from thegra_core.evaluation.workers import Runner, Told, run_tasks
-from thegra_core.outputs.files import write_atomic
+from thegra_core.outputs.files import write_atomic, writing_to
 from thegra_core.outputs.scoring import MIN_COVERAGE_PCT
 from thegra_core.outputs.trajectory import format_tum, read_tum
 
@@ -142,13 +142,11 @@ def _reference(sequence: DataSequence, folder: Path) -> tuple[Path | None, str]:
         pass
     try:
         reference = sequence.reference()
-        folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(file, f"# {reference.source}\n{format_tum(reference.trajectory)}")
-        write_atomic(facts, json.dumps({"key": key, "source": reference.source}, indent=2) + "\n")
     except InputError as error:
         return None, f"no ground truth: {error}"
-    except OSError as error:
-        raise InputError(f"cannot write to {folder}: {error.strerror}; choose another folder with --out DIR") from error
+    with writing_to(folder):
+        write_atomic(file, f"# {reference.source}\n{format_tum(reference.trajectory)}")
+        write_atomic(facts, json.dumps({"key": key, "source": reference.source}, indent=2) + "\n")
     return file, reference.source
 
 

@@ -13,7 +13,8 @@ from thegra_core.errors import InputError
 from thegra_core.evaluation.fitting import LeverArm, TimeOffset, fit_lever_arm, fit_time_offset, with_lever_arm, with_offset
 from thegra_core.messages import FloatArray, IntArray
 from thegra_core.outputs.scoring import MAX_GAP_NS, Score, score_trajectory
-from thegra_core.outputs.trajectory import NS_PER_S, Trajectory, parse_stamp, read_tum
+from thegra_core.outputs.trajectory import NS_PER_S, Trajectory, read_tum
+from thegra_core.sources.folder import parse_stamp
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +123,7 @@ def relative_error(score: Score, estimate: Trajectory, delta: int = 1) -> Relati
 
 
 def read_stamps(path: Path) -> IntArray:
-    """Stamps (F,) in nanoseconds from the first column of a list, sorted.
+    """Stamps (F,) in nanoseconds from the first column of a list of images, sorted.
 
     Raises:
         InputError: Naming the line that holds none.

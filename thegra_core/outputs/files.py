@@ -4,9 +4,27 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from thegra_core.errors import InputError
+
 _CHUNK = 1 << 20
+
+
+@contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """Make the folder if it is not there; what cannot be written while the context lasts is told as such.
+
+    Raises:
+        InputError: If something cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise InputError(f"cannot write to {folder}: {error.strerror or error}; choose another folder with --out DIR") from error
 
 
 def write_atomic(path: Path, content: str | bytes) -> Path:

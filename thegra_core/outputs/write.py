@@ -18,7 +18,7 @@ from thegra_core.config import RUN_FACTS, ThegraConfig, dump_config
 from thegra_core.errors import InputError
 from thegra_core.geometry.camera import CameraModel
 from thegra_core.messages import Float32Array, FloatArray, Run
-from thegra_core.outputs.files import sha256_of, write_atomic
+from thegra_core.outputs.files import sha256_of, write_atomic, writing_to
 from thegra_core.outputs.metrics import RunScores, Timing, run_metrics, score_run
 from thegra_core.outputs.pointcloud import format_ply
 from thegra_core.outputs.trajectory import (
@@ -70,8 +70,7 @@ def write_run(run: Run, out_dir: Path, config: ThegraConfig, recording: Recordin
     Raises:
         InputError: If the folder cannot be written or the ground truth cannot be read (after everything that needs none is written).
     """
-    try:
-        out_dir.mkdir(parents=True, exist_ok=True)
+    with writing_to(out_dir):
         files = [*_write_trajectories(run, out_dir), _write_points(run, out_dir)]
         files.append(write_atomic(out_dir / "config.yaml", run_config(config, recording, out_dir)))
         truth, problem = _read_groundtruth(groundtruth)
@@ -79,8 +78,6 @@ def write_run(run: Run, out_dir: Path, config: ThegraConfig, recording: Recordin
         metrics = run_metrics(run, config, timing, scores, recording.problems)
         files.append(write_atomic(out_dir / "metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n"))
         files.extend(_write_report(run, out_dir, config, recording, metrics, truth, scores))
-    except OSError as error:
-        raise InputError(f"cannot write to {out_dir}: {error.strerror}; choose another folder with --out DIR") from error
     if problem is not None:
         raise problem
     return WrittenRun(out_dir, metrics, tuple(files))

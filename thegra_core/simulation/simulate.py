@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from thegra_core.errors import InputError
+from thegra_core.outputs.files import writing_to
 from thegra_core.simulation.cameras import Lens, thermal_camera
 from thegra_core.simulation.exposure import Exposure
 from thegra_core.simulation.paths import STYLES, HandHeldPath, StyleName
@@ -68,7 +69,8 @@ def simulate(options: SimulationOptions, out_dir: Path, format: Format = "mcap",
     recording = replayed(options) if options.source is not None else rendered(options, "tau2" if format == "rovtio" else "a65")
     if progress is not None:
         recording = _watched(recording, progress)
-    return WRITERS[format](out_dir, recording)
+    with writing_to(out_dir.parent):
+        return WRITERS[format](out_dir, recording)
 
 
 def rendered(options: SimulationOptions, lens: Lens = "a65") -> Simulated:

@@ -25,7 +25,7 @@ from thegra_core.evaluation.benchmark.peers import best_peer, median_or_none
 from thegra_core.evaluation.scores import read_intervals, read_stamps
 from thegra_core.evaluation.tasks import RAN, run_process
 from thegra_core.messages import FloatArray
-from thegra_core.outputs.files import write_atomic
+from thegra_core.outputs.files import write_atomic, writing_to
 from thegra_core.outputs.scoring import MIN_COVERAGE_PCT, score_trajectory, spread_of, within
 from thegra_core.outputs.trajectory import Trajectory, read_tum
 from thegra_core.sources.open import open_recording
@@ -278,12 +278,9 @@ def write_report(plan: Plan, content: Mapping[str, Any], markdown: str) -> None:
     Raises:
         InputError: If it cannot be written.
     """
-    try:
-        plan.out.mkdir(parents=True, exist_ok=True)
+    with writing_to(plan.out):
         write_atomic(plan.out / "results.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
         write_atomic(plan.out / "results.md", markdown)
-    except OSError as error:
-        raise InputError(f"cannot write to {plan.out}: {error.strerror}; choose another folder with --out DIR") from error
 
 
 def recording_name(path: Path) -> str:

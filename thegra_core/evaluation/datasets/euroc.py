@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 from thegra_core.errors import InputError
+from thegra_core.evaluation.datasets.below import below
 from thegra_core.evaluation.datasets.pose_table import read_pose_table
 from thegra_core.evaluation.datasets.sequence import DataSequence, Found, Missing, Options, Reference
 from thegra_core.evaluation.datasets.staging import camera_file, image_list, moved
@@ -28,7 +29,7 @@ def find_euroc(folders: Sequence[Path], options: Options) -> Found:
     Raises:
         InputError: If there is none.
     """
-    homes = sorted({p for folder in folders for p in [folder, folder / "mav0", *folder.rglob("mav0")] if p.name == "mav0" and (p / "cam0").is_dir()}, key=lambda p: natural_key(str(p)))
+    homes = sorted({p for p in [*folders, *below(folders)] if p.name == "mav0" and (p / "cam0").is_dir()}, key=lambda p: natural_key(str(p)))
     if not homes:
         raise InputError(f"no mav0/cam0 in {', '.join(map(str, folders))}; get the ASL archives at projects.asl.ethz.ch/datasets and unpack them")
     found, missing = [], []

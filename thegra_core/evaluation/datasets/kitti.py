@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from thegra_core.errors import InputError
+from thegra_core.evaluation.datasets.below import below
 from thegra_core.evaluation.datasets.pose_table import read_pose_table
 from thegra_core.evaluation.datasets.sequence import DataSequence, Found, Missing, Options, Reference
 from thegra_core.evaluation.datasets.staging import camera_file, image_list, image_size
@@ -24,7 +25,7 @@ def find_kitti(folders: Sequence[Path], options: Options) -> Found:
     Raises:
         InputError: If there is none.
     """
-    homes = sorted({p.parent for folder in folders for p in [folder / "image_0", *folder.rglob("image_0")] if p.is_dir()}, key=lambda p: natural_key(str(p)))
+    homes = sorted({p.parent for p in below(folders) if p.name == "image_0" and p.is_dir()}, key=lambda p: natural_key(str(p)))
     if not homes:
         raise InputError(f"no image_0 in {', '.join(map(str, folders))}; get the odometry data set (grayscale, calibration, poses) at cvlibs.net/datasets/kitti")
     found, missing = [], []

@@ -14,6 +14,7 @@ from rosbags import rosbag1
 
 from thegra_core.errors import InputError
 from thegra_core.evaluation.datasets.bag_poses import pose_topics, read_bag_poses
+from thegra_core.evaluation.datasets.below import below
 from thegra_core.evaluation.datasets.sequence import DataSequence, Found, Missing, Options, Reference
 from thegra_core.evaluation.datasets.staging import camera_preset, linked_bags
 from thegra_core.evaluation.datasets.thermal_topic import thermal_topic
@@ -63,12 +64,12 @@ def in_order(bags: Sequence[Path]) -> list[Path]:
 
 def _bags(folders: Sequence[Path], name: str) -> list[Path]:
     """The bag files of the first folder of that name, or the single bag of that name."""
-    places = [f for folder in folders for f in ([folder] if folder.name.lower() == name else sorted(p for p in folder.rglob("*") if p.name.lower() == name)) if f.is_dir()]
+    places = [f for folder in folders for f in ([folder] if folder.name.lower() == name else sorted(p for p in below([folder]) if p.name.lower() == name)) if f.is_dir()]
     for place in places:
-        bags = sorted(place.rglob("*.bag"))
+        bags = sorted(p for p in below([place]) if p.suffix == ".bag")
         if bags:
             return in_order(bags)
-    return sorted(p for folder in folders for p in folder.rglob("*.bag") if p.stem.lower() == name)[:1]
+    return sorted(p for p in below(folders) if p.suffix == ".bag" and p.stem.lower() == name)[:1]
 
 
 def _pieces(name: str, bags: list[Path], options: Options) -> list[DataSequence]:

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from thegra_core.errors import InputError
+from thegra_core.evaluation.datasets.below import below
 from thegra_core.evaluation.datasets.pose_table import read_pose_table
 from thegra_core.evaluation.datasets.sequence import DataSequence, Found, Options, Reference
 from thegra_core.evaluation.datasets.staging import camera_preset
@@ -21,7 +22,7 @@ def find_tum(folders: Sequence[Path], options: Options) -> Found:
     Raises:
         InputError: If there is none.
     """
-    lists = sorted((p for folder in folders for name in LISTS for p in [folder / name, *folder.rglob(f"*/{name}")] if p.is_file()), key=lambda p: natural_key(str(p)))
+    lists = sorted((p for p in below(folders) if p.name in LISTS and p.is_file()), key=lambda p: natural_key(str(p)))
     homes = dict.fromkeys(p.parent for p in lists if (p.parent / "groundtruth.txt").is_file())
     if not homes:
         raise InputError(f"no sequence of TUM's form in {', '.join(map(str, folders))}: no folder holds rgb.txt (or images.txt) and groundtruth.txt; get them at cvg.cit.tum.de/data/datasets/rgbd-dataset")

@@ -16,6 +16,7 @@ import numpy as np
 
 from thegra_core.errors import InputError
 from thegra_core.evaluation.datasets.bag_poses import pose_topics, read_bag_poses
+from thegra_core.evaluation.datasets.below import below
 from thegra_core.evaluation.datasets.pose_table import read_pose_table
 from thegra_core.evaluation.datasets.sequence import DataSequence, Found, Missing, Options, Reference
 from thegra_core.evaluation.datasets.staging import camera_preset, image_list
@@ -60,7 +61,7 @@ def find_vivid(folders: Sequence[Path], options: Options) -> Found:
     Raises:
         InputError: If there is none.
     """
-    files = sorted((p for folder in folders for p in folder.rglob("*")), key=lambda p: natural_key(str(p)))
+    files = sorted(below(folders), key=lambda p: natural_key(str(p)))
     recordings, tables = _by_key(filter(_is_recording, files)), _by_key(filter(_is_table, files))
     camera = options.camera or _camchain(files) or camera_preset("vivid_handheld_thermal")
     found, missing = [], []

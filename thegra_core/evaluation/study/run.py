@@ -18,7 +18,7 @@ from thegra_core.features.cache import cached_extractor, cached_matcher
 from thegra_core.features.protocols import Extractor, Matcher
 from thegra_core.features.registry import make_extractor, make_matcher
 from thegra_core.messages import Frame
-from thegra_core.outputs.files import write_atomic
+from thegra_core.outputs.files import write_atomic, writing_to
 from thegra_core.outputs.trajectory import Trajectory, read_tum
 from thegra_core.preprocessing.chain import Chain
 from thegra_core.sources.open import camera_for, open_recording
@@ -62,10 +62,11 @@ def run_study(plan: Plan, progress: Callable[[str], None] | None = None) -> list
     """Run it all and write study.csv.
 
     Raises:
-        InputError: If a recording has no two frames that far apart.
+        InputError: If a recording has no two frames that far apart, or the plan's folder cannot be written.
         WeightsError: If a network's weights are not there.
     """
-    rows: list[Row] = []
+    with writing_to(plan.out):  # told before the work
+        rows: list[Row] = []
     say = progress or (lambda _: None)
     front_ends = {name: _front_end(name, plan.cache) for name in dict.fromkeys(front_end for _, front_end in variants(plan))}
     for path in plan.recordings:
@@ -78,8 +79,8 @@ def run_study(plan: Plan, progress: Callable[[str], None] | None = None) -> list
         for chain, front_end in variants(plan):
             say(f"{recording.name}: {chain}, {front_end}")
             rows += _study_pairs(recording, frames, pairs, chain, front_end, *front_ends[front_end])
-    plan.out.mkdir(parents=True, exist_ok=True)
-    write_atomic(plan.out / "study.csv", to_csv(rows))
+    with writing_to(plan.out):
+        write_atomic(plan.out / "study.csv", to_csv(rows))
     return rows
 
 
