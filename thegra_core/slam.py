@@ -171,11 +171,14 @@ class Slam:
             if shutter.shutter is Shutter.JUST_OPENED:
                 self._tracking.reopen()
             output = self._hold(frame, shutter) if prepared.image is None else self._see(frame, prepared.image)
+        self._record(frame.index, output.result, output.provisional, bad=shutter is None)
+        if shutter is not None:
             with self._timed("mapping"):
-                self._take_updates()
+                self._take_updates()  # after the frame has its place beside a keyframe, which updates may move
+            self._place_beside_itself(output.provisional or output.result)
         self._stage_ms["total"] = sum(prepared.stage_ms.values()) + 1e3 * (time.perf_counter() - begin)
         result = replace(output.result, stage_ms=dict(self._stage_ms))
-        self._record(frame.index, result, output.provisional, bad=shutter is None)
+        self._frames[-1] = replace(self._frames[-1], result=result)
         return result
 
     @property
@@ -358,6 +361,12 @@ class Slam:
             return
         reference_id, relative = self._tracking.relative_to_reference(placed)
         self._frames.append(_Placed(result, index, self._tracking.map_id, reference_id, relative, afterwards=provisional is not None))
+
+    def _place_beside_itself(self, result: TrackingResult) -> None:
+        """The frame recorded last, where it is a keyframe that the map knows by now."""
+        current, placed = self._tracking.map, self._frames[-1]
+        if result.is_keyframe and current is not None and placed.map_id == current.map_id and result.reference_id in current.keyframes:
+            self._frames[-1] = replace(placed, reference_id=result.reference_id, reference_from_camera=np.eye(4))
 
     def _follow(self, update: MapUpdate) -> None:
         """Frames keep their place when their keyframe leaves the map, when a loop changes the scale there, or their map becomes part of another."""

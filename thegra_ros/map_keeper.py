@@ -102,8 +102,7 @@ class MapKeeper:
     def drop(self, map_id: int) -> Kept:
         """Forget a map, if it is there."""
         assert self._mapper is not None
-        if map_id in self._mapper.map_ids:
-            self._mapper.drop(map_id)
+        self._mapper.drop(map_id)
         return self._kept(self._mapper)
 
     def save(self, path: Path) -> None:

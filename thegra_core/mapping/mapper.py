@@ -183,7 +183,9 @@ class Mapper:
         return editor.take_update()
 
     def drop(self, map_id: int) -> None:
-        """Forget a map that tracking has given up."""
+        """Forget a map that tracking has given up; one that has become part of another meanwhile stays that."""
+        if map_id not in self._editors:
+            return
         self._full.cancel(map_id)
         del self._editors[map_id], self._trial[map_id], self._graphs[map_id], self._loops[map_id]
 

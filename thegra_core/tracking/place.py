@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thegra_core.map.map import Map
-from thegra_core.messages import Features, Keyframe, MapUpdate, VisibilityCounts
+from thegra_core.messages import Features, Keyframe, MapUpdate
 from thegra_core.places.index import PlaceIndex
 from thegra_core.tracking.followed import TrackLandmarks
 from thegra_core.tracking.motion import MotionModel
+from thegra_core.tracking.visibility import VisibilityTally
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(slots=True)
@@ -37,8 +37,7 @@ class Place:
     search_frames: int = 0
     resumed: bool = False
     motion: MotionModel = field(default_factory=MotionModel)
-    visible: list[IntArray] = field(default_factory=list)
-    found: list[IntArray] = field(default_factory=list)
+    seen: VisibilityTally = field(default_factory=VisibilityTally)
     tracks: TrackLandmarks = field(default_factory=TrackLandmarks)
     pending: dict[int, Keyframe] = field(default_factory=dict)
     awaited_since_ns: int | None = None
@@ -62,6 +61,7 @@ class Place:
 
     def take(self, update: MapUpdate) -> None:
         self.map.apply(update)
+        self.reference_id, self.last_keyframe_id = (self._or_heir(i, update) for i in (self.reference_id, self.last_keyframe_id))
         if update.adjusted_id >= self.unadjusted_id:
             self.unadjusted_id = -1
         for removed in update.removed_keyframes:
@@ -77,10 +77,9 @@ class Place:
     def predict(self, stamp_ns: int) -> FloatArray | None:
         return self.motion.predict(stamp_ns) if self.lost_frames == 0 else None
 
-    def take_counts(self) -> VisibilityCounts:
-        visible, visible_counts = np.unique(np.concatenate(self.visible), return_counts=True)
-        found, found_counts = np.unique(np.concatenate(self.found), return_counts=True)
-        counts = np.zeros(len(visible), dtype=np.int64)
-        counts[np.searchsorted(visible, found)] = found_counts
-        self.visible, self.found = [], []
-        return VisibilityCounts(visible, visible_counts.astype(np.int64), counts)
+    def _or_heir(self, keyframe_id: int, update: MapUpdate) -> int:
+        """The keyframe, or the one that stays for it where an update has removed it."""
+        heirs = {removed.id: removed.heir_id for removed in update.removed_keyframes}
+        while keyframe_id in heirs and keyframe_id not in self.map.keyframes:
+            keyframe_id = heirs[keyframe_id]
+        return keyframe_id

@@ -88,7 +88,7 @@ class TrackingStage:
         self._initializer = Initializer(camera, config, matcher, submit)
         self._place: Place | None = None
         self._before: Place | None = None
-        self._next_keyframe_id = 0
+        self._first_keyframe_id = self._next_keyframe_id = 0
         self._next_map_id = 0
         self._unplaced: deque[Features] = deque(maxlen=config.relocalization.remembered_frames)
         self.localization_only = False
@@ -212,7 +212,8 @@ class TrackingStage:
         place = Place(Map(update.map_id, self._camera), self._place_index(), newest, newest, probation=0, lost_frames=1, resumed=True)
         place.search_frames = self._config.relocalization.search_frames
         self._place = place
-        self._next_map_id, self._next_keyframe_id = max(update.map_id + 1, next_map_id), max(newest + 1, next_keyframe_id)
+        self._next_map_id = max(update.map_id + 1, next_map_id)
+        self._first_keyframe_id = self._next_keyframe_id = max(newest + 1, next_keyframe_id)
         self.apply(update)
 
     def reopen(self) -> None:
@@ -251,17 +252,22 @@ class TrackingStage:
                 place.pending = {i: replace(k, world_from_camera=(moved @ Similarity(k.world_from_camera)).rigid) for i, k in place.pending.items()}
 
     def _move_into(self, update: MapUpdate, absorbed: Absorbed) -> None:
-        """Go on in the map that has taken in the current one; that the two fit proves the current one."""
-        place = self._place
-        if place is None or place.map.map_id != absorbed.map_id:
-            return
-        place.map, place.places = Map(update.map_id, self._camera), self._place_index()
-        place.take(update)
-        place.motion.move(Similarity(absorbed.rigid, absorbed.scale))
-        place.reference_id = place.last_keyframe_id = newest = max(m.id for m in update.new_keyframes)
-        place.tracks.replace(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
-        place.probation, self._before, place.unadjusted_id = 0, None, -1
-        place.visible, place.found, place.pending = [], [], {}
+        """Go on in the map that has taken in another, where a place is in one of the two; that they fit proves the current one."""
+        for place in (self._place, self._before):
+            if place is None or place.map.map_id not in (absorbed.map_id, update.map_id):
+                continue
+            moves = place.map.map_id == absorbed.map_id
+            place.map, place.places = Map(update.map_id, self._camera), self._place_index()
+            place.take(update)
+            if not moves:
+                continue
+            place.motion.move(Similarity(absorbed.rigid, absorbed.scale))
+            place.reference_id = place.last_keyframe_id = newest = max(m.id for m in update.new_keyframes)
+            place.tracks.replace(place.map.keyframes[newest].features, place.map.keyframes[newest].landmark_ids)
+            place.unadjusted_id, place.pending = -1, {}
+            place.seen.forget()
+            if place is self._place:
+                place.probation, self._before = 0, None
 
     def relative_to_reference(self, result: TrackingResult) -> tuple[int, FloatArray]:
         """A keyframe of the current map and reference_from_camera (4, 4) of a result that has a pose; one that mapping does not know yet is its own."""
@@ -282,7 +288,7 @@ class TrackingStage:
         if self._place is None:
             return placed
         current = self._place.map
-        keyframe_stamps = {k.stamp_ns for k in current.keyframes.values()}
+        keyframe_stamps = {k.stamp_ns for k in current.keyframes.values() if k.id >= self._first_keyframe_id}
         for features in self._unplaced:
             if features.stamp_ns in keyframe_stamps:
                 continue
@@ -376,8 +382,7 @@ class TrackingStage:
         place.probation = max(0, place.probation - 1)
         place.motion.update(features.stamp_ns, found.world_from_camera, found.covariance)
         if not self.localization_only:
-            place.visible.append(found.visible_ids)
-            place.found.append(found.landmark_ids[found.landmark_ids >= 0])
+            place.seen.note(found.visible_ids, found.landmark_ids[found.landmark_ids >= 0])
 
     @staticmethod
     def _result(place: Place, features: Features, found: Localization, reference_id: int, is_keyframe: bool) -> TrackingResult:
@@ -404,7 +409,7 @@ class TrackingStage:
             return None
         keyframe = Keyframe(
             self._next_keyframe_id, features.stamp_ns, found.world_from_camera, features, found.landmark_ids, place.reference_id, place.map.map_id,
-            matches, place.take_counts(), place.map.version,
+            matches, place.seen.take(), place.map.version,
         )  # fmt: skip
         self._next_keyframe_id += 1
         place.pending[keyframe.id], place.ratios = keyframe, ()
@@ -467,7 +472,7 @@ class TrackingStage:
         if place.lost_frames == 0:
             self.losses += 1
             logger.warning("lost at %.3f s: %s", features.stamp_ns / 1e9, reason)
-        place.lost_frames += 1
+        place.lost_frames, place.unadjusted_id = place.lost_frames + 1, -1
         if place.lost_frames >= self._config.relocalization.new_map_after_frames and not self.localization_only:
             initial = self._initializer.add(features, None, self._next_map_id, self._next_keyframe_id)
             if not isinstance(initial, str):
