@@ -72,6 +72,11 @@ class Stages:
             self.graph.send([next(frames)])
             self.graph.spin_until(lambda n=done: self.value("tracking", "processed") > n or reached(), RETRY_S)
 
+    def poses_come(self, frames: list[Frame], least: int, what: str) -> None:
+        """Send frames over and over until so many more of them have a pose."""
+        before = len(self.graph.received["pose"])
+        self.send_until(again(frames), lambda: len(self.graph.received["pose"]) >= before + least, what)
+
     def restart(self, name: str, camera) -> None:
         """Kill a node, and start it again."""
         self.nodes[name].process.kill()

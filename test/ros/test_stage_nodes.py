@@ -12,13 +12,14 @@ import signal
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import SetParameters
 from ros_graph import OFFLINE, Graph, children, set_parameter
 from stages import STAGES, Stages, again
 from std_srvs.srv import SetBool, Trigger
 
 from thegra_core.config import load_config
-from thegra_core.messages import Frame, Shutter, ShutterState, TrackingState
+from thegra_core.messages import Shutter, ShutterState, TrackingState
 from thegra_core.outputs.scoring import align
 from thegra_core.outputs.trajectory import read_tum
 from thegra_core.slam import Slam
@@ -112,13 +113,9 @@ def test_a_node_that_is_killed_and_started_again_is_taken_back(graph: Graph, fra
     answer = graph.call(Trigger, "mapping/save_map", Trigger.Request())
     assert answer.success and kept.is_file(), answer.message
 
-    def poses_come(frames: list[Frame], least: int, what: str) -> None:
-        before = len(graph.received["pose"])
-        stages.send_until(again(frames), lambda: len(graph.received["pose"]) >= before + least, what)
-
     for name in ("tracking", "frontend", "preprocessing"):
         stages.restart(name, camera)
-        poses_come(frames[20:24], 2, f"poses with a new {name}")
+        stages.poses_come(frames[20:24], 2, f"poses with a new {name}")
         assert stages.value("mapping", "maps") == maps, "no new map was begun"
     assert "sought in the map" in stages.nodes["tracking"].output
 
@@ -135,6 +132,36 @@ def test_a_node_that_is_killed_and_started_again_is_taken_back(graph: Graph, fra
     assert graph.call(SetParameters, "mapping/set_parameters", set_map_file).results[0].successful
     answer = graph.call(Trigger, "mapping/load_map", Trigger.Request())
     assert answer.success, answer.message
-    poses_come(frames[14:22], 3, "poses in the map that was loaded")
+    stages.poses_come(frames[14:22], 3, "poses in the map that was loaded")
     assert graph.call(SetBool, "tracking/localization_only", SetBool.Request(data=True)).success
+    assert stages.end() == [0, 0, 0, 0]
+
+
+@pytest.mark.slow
+def test_tracking_goes_on_when_mapping_does(graph: Graph, frames, camera) -> None:
+    """With an answer that only comes late it goes on as it was; a keyframe that mapping did not take, as it was not active, is in the map of neither."""
+    stages = Stages(graph, camera, frames[0])
+    stages.send(frames[:20])
+    graph.wait_for_pose(frames[19])
+    tracking, mapping = stages.nodes["tracking"], stages.nodes["mapping"].process
+    to_and_fro = [*frames[20:], *frames[-2:20:-1]]
+    begun = tracking.output.count("tracking begins again")
+
+    def wait_in_vain() -> None:
+        said = tracking.output.count("waiting for the node mapping")
+        stages.send_until(again(to_and_fro), lambda: tracking.output.count("waiting for the node mapping") > said, "a keyframe without an answer")
+
+    os.kill(mapping.pid, signal.SIGSTOP)
+    wait_in_vain()
+    os.kill(mapping.pid, signal.SIGCONT)
+    stages.poses_come(to_and_fro, 20, "poses, the answer being there")
+
+    assert graph.change_state(Transition.TRANSITION_DEACTIVATE, "mapping")
+    wait_in_vain()
+    assert tracking.output.count("tracking begins again") == begun
+    maps = stages.value("mapping", "maps")
+    assert graph.change_state(Transition.TRANSITION_ACTIVATE, "mapping")
+    stages.poses_come(frames[16:22], 3, "poses in the map that mapping has kept")
+    assert tracking.output.count("tracking begins again") == begun + 1 and "sought in the map" in tracking.output
+    assert stages.value("mapping", "maps") == maps, "no new map was begun"
     assert stages.end() == [0, 0, 0, 0]

@@ -1,7 +1,8 @@
 """Keyframes in; the map's updates, its points and its keyframes' path out.
 
 Mapping owns the map, which a process of its own keeps. Tracking asks for it when it begins (`begin`), and gets it whole (`resume`) or hears that it is `empty`; a word of a map that is not
-known here is answered with `unknown`, upon which tracking begins again.
+known here is answered with `unknown`, upon which tracking begins again. Tracking that hears nothing of a keyframe asks whether it is `known?`: what was sent while this node was not active
+is in no map, or its update was lost, and by then all that came before the question is answered. So the answer is `unknown`, which tracking passes by where the update was only late.
 """
 
 from __future__ import annotations
@@ -75,6 +76,8 @@ class MappingNode(StageNode):
             self._of, self._kept = self._camera.camera, None
         if kind == "begin":
             self._begin(tables[0], stamp)
+        elif kind == "known?":
+            self._send("unknown", [word({"question": tables[0].facts["question"]})], stamp)
         elif self._kept is None or self._replaced:
             self._send("unknown", [word({})], stamp)
         elif kind == "drop":

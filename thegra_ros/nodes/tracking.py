@@ -133,8 +133,8 @@ class TrackingNode(StageNode):
         self._poses.forget()
         self._question += 1
         question = {"question": str(self._question), "beginning": beginning.value}
-        answer = self._ask_mapping("begin", [word(question)], stamp, ("resume", "empty"), question["question"])
-        if answer is None:
+        answer = self._ask_mapping("begin", [word(question)], stamp, question["question"])
+        if answer is None or answer[0] == "unknown":
             self._beginning = self._beginning or beginning
             return None
         kind, tables = answer
@@ -199,12 +199,17 @@ class TrackingNode(StageNode):
             kind, tables = "keyframe", keyframe_tables(output.keyframe)
         else:
             return
-        answer = self._ask_mapping(kind, tables, stamp, ("update",))
-        if answer is not None:
+        answer = self._ask_mapping(kind, tables, stamp, str(stamp))
+        if answer is None:
+            return
+        if answer[0] == "update":
             stage.apply(tables_update(answer[1]))
+        elif self._beginning is None:
+            self._want(Beginning.RESUME, "mapping does not have the last keyframe, or its answer was lost")
 
-    def _ask_mapping(self, kind: str, tables: list[Table], stamp: int, expected: tuple[str, ...], question: str = "") -> tuple[str, list[Table]] | None:
-        """Send a record and wait for what mapping answers; None when it wants tracking to begin, or the node ends."""
+    def _ask_mapping(self, kind: str, tables: list[Table], stamp: int, question: str) -> tuple[str, list[Table]] | None:
+        """Send a record and wait for what mapping answers, to this question where it names one; None when tracking is to begin, or the node ends."""
+        expected = ("resume", "empty", "unknown") if kind == "begin" else ("update", "unknown")
         while not self._updates.empty():  # answers that nobody waits for any more
             self._updates.get()
         self._send(kind, tables, stamp)
@@ -213,9 +218,9 @@ class TrackingNode(StageNode):
                 answer = self._updates.get(timeout=PATIENCE_S)
             except queue.Empty:
                 self.get_logger().warning("waiting for the node mapping, which does not answer")
-                self._send(*(("begin", tables, stamp) if kind == "begin" else ("known?", [word({})], stamp)))
+                self._send(*(("begin", tables, stamp) if kind == "begin" else ("known?", [word({"question": question})], stamp)))
                 continue
-            if answer[0] in expected and answer[1][0].facts.get("question", "") == question:
+            if answer[0] in expected and answer[1][0].facts.get("question", question) == question:
                 return answer
         return None
 
@@ -258,7 +263,7 @@ class TrackingNode(StageNode):
         record = self._assembler.add(cloud)
         if record is None:
             return
-        if record[0] == "unknown":
+        if record[0] == "unknown" and "question" not in record[1][0].facts:  # an answer is for the thread, if it still waits
             self._want(Beginning.RESUME, "mapping was started again, or has another map")
         self._updates.put(record)  # also wakes the thread
 
