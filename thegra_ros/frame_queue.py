@@ -23,16 +23,18 @@ class LatestQueue(Generic[T]):
         self._closed = False
         self._dropped = 0
 
-    def put(self, item: T) -> None:
-        """Add an item; never waits."""
+    def put(self, item: T) -> T | None:
+        """Add an item; never waits. The one that it pushed out, if any."""
         with self._changed:
             if self._closed:
-                return
+                return None
+            pushed_out = None
             if len(self._items) >= self._size:
-                self._items.popleft()
+                pushed_out = self._items.popleft()
                 self._dropped += 1
             self._items.append(item)
             self._changed.notify()
+            return pushed_out
 
     def put_first(self, item: T) -> bool:
         """Add an item that must not be lost; False once the queue is closed."""

@@ -33,7 +33,7 @@ class _Task:
 
 
 class StageNode(ManagedNode):
-    """Derived nodes override `prepare` (topics), `load` (networks, in the thread), `work` (one item, in the thread) and `begin_anew`."""
+    """Derived nodes override `prepare` (topics), `load` (networks, in the thread), `work` (one item, in the thread), `pushed_out` and `begin_anew`."""
 
     queue_size = 0  # 0: as the parameter says
 
@@ -54,6 +54,9 @@ class StageNode(ManagedNode):
     def work(self, item: Any) -> None:
         """Work on an item."""
 
+    def pushed_out(self, item: Any) -> None:
+        """An item went for a newer one and is not worked on; called by who enqueues."""
+
     def begin_anew(self, why: str) -> None:
         """Forget what was known of the stream."""
 
@@ -64,7 +67,9 @@ class StageNode(ManagedNode):
     def enqueue(self, item: Any) -> None:
         """Hand an item to the thread."""
         if self.active and self.queue is not None:
-            self.queue.put(item)
+            gone = self.queue.put(item)
+            if gone is not None:
+                self.pushed_out(gone)
 
     async def ask(self, do: Callable[[], str]) -> str:
         """Have something done in the thread, before the items that wait; what it returned.

@@ -20,8 +20,8 @@ def drain(queue: LatestQueue[int]) -> list[int]:
 @given(st.integers(1, 5), st.lists(st.integers(), max_size=20))
 def test_a_full_queue_drops_the_oldest_and_counts_it(size: int, items: list[int]) -> None:
     queue: LatestQueue[int] = LatestQueue(size)
-    for item in items:
-        queue.put(item)
+    gone = [queue.put(item) for item in items]
+    assert gone == [None] * min(size, len(items)) + items[:-size]
     assert queue.dropped == max(0, len(items) - size)
     assert drain(queue) == items[-size:]
 

@@ -57,8 +57,8 @@ class Beginning(Enum):
 class TrackingNode(StageNode):
     """The third stage."""
 
-    def __init__(self) -> None:
-        super().__init__("tracking")
+    def __init__(self, **options: Any) -> None:
+        super().__init__("tracking", **options)
         self.offer(Trigger, "~/reset", self._on_reset)
         self.offer(SetBool, "~/localization_only", self._on_localization_only)
 
@@ -111,6 +111,10 @@ class TrackingNode(StageNode):
         self._tell_mapping(stage, output, notice)
         self._tell_frontend(stage)
         self._told(output.result)
+
+    def pushed_out(self, item: Mapping[str, Any]) -> None:
+        if "followed" in item:  # frontend waits for a word of this one, too
+            self._verdicts.publish(verdict_message(item["notice"].shutter.stamp_ns, None))
 
     def begin_anew(self, why: str) -> None:
         self._beginning = Beginning.FRESH
