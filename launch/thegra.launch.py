@@ -19,6 +19,7 @@ ARGUMENTS = {
     "namespace": ("thegra", "namespace of nodes and topics"),
     "image": ("", "the camera's image topic; empty: image_raw in the namespace"),
     "camera_info": ("", "the camera's camera_info topic; empty: beside the image topic"),
+    "image_transport": ("", "raw, or compressed: images are on compressed below the image topic; empty: what params_file says"),
     "params_file": ("", "YAML with parameters; empty: the one that ships with the package"),
     "profile": ("", "paper, quality, fast or realtime; empty: what params_file says, else realtime"),
     "camera_file": ("", "calibration file; wins over camera_info; empty: what params_file says"),
@@ -71,7 +72,7 @@ def play_arguments(given: dict[str, str]) -> list[str]:
 
 def parameters(given: dict[str, str]) -> dict[str, object]:
     """Parameters that the arguments give; what is empty is left to the file."""
-    texts = {name: given[name] for name in ("profile", "camera_file", "base_frame", "odom_frame") if given[name]}
+    texts = {name: given[name] for name in ("profile", "camera_file", "image_transport", "base_frame", "odom_frame") if given[name]}
     return {**texts, "use_sim_time": is_true(given["use_sim_time"]), "autostart": is_true(given["autostart"])}
 
 

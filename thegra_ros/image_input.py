@@ -37,6 +37,11 @@ class ImageInput:
         backwards = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         self._jumps = node.get_clock().create_jump_callback(backwards, post_callback=self._on_jump)
 
+    @property
+    def topic(self) -> str:
+        """Where the images come from, in full."""
+        return self._topic
+
     def forget(self) -> None:
         """Take the next stamp as the first."""
         self._stamps.forget()

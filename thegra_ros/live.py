@@ -100,7 +100,7 @@ def ros_arguments(options: LiveOptions) -> list[str]:
     arguments = [*(extra or ["--ros-args"]), "-r", f"__ns:=/{options.namespace.strip('/')}"]
     if options.image is not None:
         topic = "/" + options.image.strip("/")
-        arguments += ["-r", f"image_raw:={topic}", "-r", f"camera_info:={topic.rsplit('/', 1)[0]}/camera_info"]
+        arguments += ["-r", f"image_raw:={topic}", "-r", f"image_raw/compressed:={topic}/compressed", "-r", f"camera_info:={topic.rsplit('/', 1)[0]}/camera_info"]
     for name, file in (("camera_file", options.camera), ("config_file", options.config)):
         if file is not None:
             if not file.is_file():

@@ -47,6 +47,7 @@ def test_options_become_ros_arguments(tmp_path: Path) -> None:
     arguments = ros_arguments(options)
     assert arguments[:3] == ["--ros-args", "-r", "__ns:=/mine"], "the user's own remapping comes first, and the first wins"
     assert "__ns:=/uav1" in arguments and "image_raw:=/boson/image_raw" in arguments and "camera_info:=/boson/camera_info" in arguments
+    assert "image_raw/compressed:=/boson/image_raw/compressed" in arguments, "remapping rules match whole names"
     assert f"camera_file:={camera}" in arguments and "profile:=fast" in arguments
 
 

@@ -15,10 +15,12 @@ import cv2
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from ros_graph import LIMIT_S, Graph
+from sensor_msgs.msg import CompressedImage
 
 from thegra_ros.codec.stamps import stamp_ns
 from thegra_ros.environment import config_file
 from thegra_ros.gap_watch import SPAN, GapWatch
+from thegra_ros.live import LiveOptions, ros_arguments
 from thegra_ros.qos import LOSSLESS
 
 S = 10**9
@@ -56,6 +58,14 @@ def test_missing_images_are_said_where_no_profile_is_set(graph: Graph, frames) -
     graph.send([replace(frames[0], stamp_ns=S + i * S // RATE_HZ) for i in times[: SPAN + 5]])
     graph.wait(lambda: "images are missing" in node.output, "a word about the loss")
     assert "FASTRTPS_DEFAULT_PROFILES_FILE" in node.output
+    assert node.end() == 0
+
+
+def test_compressed_images_are_taken_from_beside_the_topic_that_is_named(graph: Graph) -> None:
+    images = graph.node.create_publisher(CompressedImage, "/boson/image_raw/compressed", 5)
+    node = graph.start(parameters={"image_transport": "compressed"}, extra=ros_arguments(LiveOptions("boson/image_raw"))[1:])
+    graph.wait(lambda: images.get_subscription_count() > 0, "the node")
+    graph.wait(lambda: "images from /boson/image_raw/compressed" in node.output, "a word of where images come from")
     assert node.end() == 0
 
 

@@ -67,7 +67,7 @@ class SlamNode(ManagedNode):
         self._worker.start()
         self._settings.configured = True
         begins = f"; the camera is sought in the map of {self._home}" if self._home is not None else ""
-        self.get_logger().info(f"profile {self._config.profile}; images from {self.resolve_topic_name('image_raw')}{begins}")
+        self.get_logger().info(f"profile {self._config.profile}; images from {self._images.topic}{begins}")
 
     def deactivate(self) -> None:
         if self._worker is not None:
