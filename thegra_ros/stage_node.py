@@ -7,7 +7,7 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from thegra_core.errors import ThegraError
 from thegra_core.process import keep_freed_memory, set_threads
@@ -24,12 +24,15 @@ EVERYTHING = 10**6
 """Size of a queue that drops nothing."""
 
 
+T = TypeVar("T")
+
+
 @dataclass(frozen=True, slots=True)
-class _Task:
+class _Task(Generic[T]):
     """Something to do between two items."""
 
-    do: Callable[[], str]
-    answer: Future[str] = field(default_factory=Future)
+    do: Callable[[], T]
+    answer: Future[T] = field(default_factory=Future)
 
 
 class StageNode(ManagedNode):
@@ -77,10 +80,14 @@ class StageNode(ManagedNode):
         Raises:
             Exception: What it raised.
         """
+        return await result_of(self, self.do_first(do))
+
+    def do_first(self, do: Callable[[], T]) -> Future[T]:
+        """Have something done in the thread, before the items that wait, which is never dropped, also while the node is not active; what will come of it."""
         task = _Task(do)
         if self.queue is None or not self.queue.put_first(task):
             _refuse(task)
-        return await result_of(self, task.answer)
+        return task.answer
 
     def tell(self, text: str) -> None:
         """Say what keeps the stage from working."""
@@ -148,7 +155,7 @@ def _words(error: Exception) -> str:
     return str(error) if isinstance(error, ThegraError | EngineError) else traceback.format_exc()
 
 
-def _do(task: _Task) -> None:
+def _do(task: _Task[Any]) -> None:
     try:
         task.answer.set_result(task.do())
     except Exception as error:  # it is the asker's to tell
@@ -161,5 +168,5 @@ def _close(queue: LatestQueue[Any]) -> None:
             _refuse(item)
 
 
-def _refuse(task: _Task) -> None:
+def _refuse(task: _Task[Any]) -> None:
     task.answer.set_exception(ThegraError("the stage does not work: /diagnostics and the log say why"))

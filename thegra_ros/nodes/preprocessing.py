@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image
@@ -22,8 +23,8 @@ from thegra_ros.stage_node import StageNode
 class PreprocessingNode(StageNode):
     """The first stage."""
 
-    def __init__(self) -> None:
-        super().__init__("preprocessing")
+    def __init__(self, **options: Any) -> None:
+        super().__init__("preprocessing", **options)
         self._input: ImageInput | None = None
         self.offer(SetBool, "~/pause", self._on_pause)
 
@@ -40,11 +41,8 @@ class PreprocessingNode(StageNode):
         self._input = None
         super().release()
 
-    def work(self, item: tuple[Frame | None, str]) -> None:
+    def work(self, item: tuple[Frame, str]) -> None:
         frame, frame_id = item
-        if frame is None:
-            self._fresh()
-            return
         prepared = self._stage.process(frame)
         if prepared.shutter is None:
             self.health.bad[prepared.trouble] += 1
@@ -62,12 +60,12 @@ class PreprocessingNode(StageNode):
         return "paused: images are ignored" if request.data else "images are worked on"
 
     def _restart(self, why: str) -> None:
-        """In the order of the images: what waits is of the old run."""
+        """In the order of the images: what waits is of the old run, what comes of the new one."""
         if self._input is not None:
             self._input.forget()
         if self.queue is not None:
             self.queue.clear()
-        self.enqueue((None, ""))
+        self.do_first(self._fresh)
         self.get_logger().info(f"the stream begins anew: {why}")
 
     def _fresh(self) -> None:
