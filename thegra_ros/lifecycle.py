@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import threading
 import time
@@ -28,6 +29,10 @@ WAKE_S = 0.5
 """A shutdown wakes the executor, but not always; it looks by itself so often."""
 LAST_WORDS_S = 2.3
 """How long a node that is told to end may take to release what it holds."""
+MOST_INTERRUPTS = 2
+"""So many are one: impatience, or a terminal and a supervisor."""
+FINALIZATION_S = 10.0
+"""How long Python's own end may take, in which SIGINT is ignored."""
 
 
 class ManagedNode(LifecycleNode):
@@ -162,6 +167,21 @@ class ManagedNode(LifecycleNode):
         return guard
 
 
+class _Interrupt:
+    """SIGINT ends a node by an exception, once: raised again it would break off the end. More than `MOST_INTERRUPTS` end the process where it is."""
+
+    def __init__(self) -> None:
+        self.ending = False
+        self._count = 0
+
+    def __call__(self, *_: object) -> None:
+        self._count += 1
+        if self._count > MOST_INTERRUPTS:
+            _end(1)
+        if self._count == 1 and not self.ending:
+            raise KeyboardInterrupt
+
+
 @dataclass
 class _Outcome:
     """What the process is to end with, for whoever ends it."""
@@ -176,6 +196,8 @@ def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = 
     killed nor a thread that still computes keeps a node alive.
     """
     end_with_supervisor()
+    interrupt = _Interrupt()
+    signal.signal(signal.SIGINT, interrupt)  # before rclpy.init: its handler shuts the context down, and calls this one
     try:
         rclpy.init(args=arguments)
     except Exception as error:  # RCLError is no public class
@@ -203,11 +225,14 @@ def run_node(make: Callable[[], ManagedNode], arguments: Sequence[str] | None = 
             traceback.print_exc()
             outcome.code = 1
     finally:
+        interrupt.ending = True
         if node is not None:
             node.end()
             executor.remove_node(node)
             node.destroy_node()
         rclpy.try_shutdown()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Python's own end puts the default back: one that comes then would become the exit code
+        signal.setitimer(signal.ITIMER_REAL, FINALIZATION_S)  # the kernel ends what hangs there
         if any(thread.daemon and thread.name != WATCH for thread in threading.enumerate()):
             _end(outcome.code)
     return outcome.code

@@ -100,7 +100,8 @@ def ros_arguments(options: LiveOptions) -> list[str]:
     arguments = [*(extra or ["--ros-args"]), "-r", f"__ns:=/{options.namespace.strip('/')}"]
     if options.image is not None:
         topic = "/" + options.image.strip("/")
-        arguments += ["-r", f"image_raw:={topic}", "-r", f"image_raw/compressed:={topic}/compressed", "-r", f"camera_info:={topic.rsplit('/', 1)[0]}/camera_info"]
+        names = {"image_raw": topic, "image_raw/compressed": f"{topic}/compressed", "camera_info": f"{topic.rsplit('/', 1)[0]}/camera_info"}
+        arguments += [argument for mine, theirs in names.items() for argument in ("-r", f"{mine}:={theirs}")]
     for name, file in (("camera_file", options.camera), ("config_file", options.config)):
         if file is not None:
             if not file.is_file():

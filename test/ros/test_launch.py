@@ -77,8 +77,8 @@ def test_one_node_by_default(launch_file: Any, monkeypatch: pytest.MonkeyPatch) 
 
 def test_arguments_reach_the_nodes(launch_file: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "mine.xml")
-    *nodes, rviz = run(launch_file, single_process="false", image="/boson/image_raw", profile="fast", image_transport="compressed", use_sim_time="true", rviz="true",
-                       base_frame="base_link")  # fmt: skip
+    of_camera = {"image": "/boson/image_raw", "image_transport": "compressed"}
+    *nodes, rviz = run(launch_file, single_process="false", **of_camera, profile="fast", use_sim_time="true", rviz="true", base_frame="base_link")
     assert [n.kwargs["executable"] for n in nodes] == list(launch_file.STAGES), "the user's own profile of Fast DDS stays"
     for node in nodes:
         assert dict(node.kwargs["remappings"]) == {"image_raw": "/boson/image_raw", "image_raw/compressed": "/boson/image_raw/compressed", "camera_info": "/boson/camera_info"}

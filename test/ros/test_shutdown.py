@@ -174,3 +174,63 @@ def test_what_cannot_be_told_to_stop_keeps_no_node_alive(graph: Graph, how: tupl
         if not code:
             node.terminate()
         assert node.wait() == code
+
+
+WAITS = """
+import os, sys
+import thegra_ros.lifecycle as lifecycle
+
+last_words_s, chosen = sys.argv[1:]
+
+def wait_in(place):
+    if place == chosen:
+        os.write(1, b"ends\\n")
+        os.read(0, 1)
+
+class Waits(lifecycle.ManagedNode):
+    def __init__(self):
+        super().__init__("waits")
+
+    def activate(self):
+        os.write(1, b"works\\n")
+
+    def release(self):
+        wait_in("release")
+
+class Last:
+    def __del__(self):
+        wait_in("finalization")
+
+_last = Last()  # names with an underscore go first
+lifecycle.LAST_WORDS_S = float(last_words_s)
+sys.exit(lifecycle.run_node(Waits, []))
+"""
+
+
+def ending(graph: Graph, place: str, last_words_s: float = 60.0) -> subprocess.Popen[bytes]:
+    """A node that was told to end and does so, waiting somewhere for a byte that it is sent."""
+    command = [sys.executable, "-c", WAITS, str(last_words_s), place]
+    node = subprocess.Popen(command, env=graph.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert node.stdout is not None
+    assert node.stdout.readline() == b"works\n"
+    node.send_signal(signal.SIGINT)
+    assert node.stdout.readline() == b"ends\n"
+    return node
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("place", ["release", "finalization"])
+def test_a_second_signal_changes_nothing(graph: Graph, place: str, number: int) -> None:
+    with ending(graph, place) as node:
+        node.send_signal(number)
+        _, said = node.communicate(b"\n")
+    assert node.returncode == 0 and b"Traceback" not in said, said.decode()
+
+
+def test_more_signals_end_what_hangs(graph: Graph, stopped: list[int]) -> None:
+    with ending(graph, "release", last_words_s=1e6) as node:
+        stopped.append(node.pid)
+        while node.poll() is None:
+            node.send_signal(signal.SIGINT)
+            graph.spin_for(0.1)
+    assert node.returncode == 1

@@ -1,8 +1,9 @@
 """Keyframes in; the map's updates, its points and its keyframes' path out.
 
 Mapping owns the map, which a process of its own keeps. Tracking asks for it when it begins (`begin`), and gets it whole (`resume`) or hears that it is `empty`; a word of a map that is not
-known here is answered with `unknown`, upon which tracking begins again. Tracking that hears nothing of a keyframe asks whether it is `known?`: what was sent while this node was not active
-is in no map, or its update was lost, and by then all that came before the question is answered. So the answer is `unknown`, which tracking passes by where the update was only late.
+known here is answered with `unknown`, upon which tracking begins again. Tracking that hears nothing of a keyframe asks whether it is `known?`. All that came before that
+question is answered by then: the keyframe came, or its update went out, while this node was not active. So the answer is `unknown`, which tracking passes by where the update
+was only late.
 """
 
 from __future__ import annotations
