@@ -63,11 +63,18 @@ class PoseOutputs:
         self._path_publisher = node.publisher(Path, "path", LATCHED)
         self.transforms = TransformPublisher(node, frames, config.publish_tf)
         self._path = ThinningPath(config.path_length)
+        self._frames = frames
         self._map_id: int | None = None
         self._path_sent_ns = 0
 
     def publish(self, result: TrackingResult, frames: Frames) -> None:
-        """Publish a result: a tracked pose everywhere, a predicted one on `odometry` only and with a variance that says so, else nothing."""
+        """Publish a result: a tracked pose everywhere, a predicted one on `odometry` only and with a variance that says so, else nothing.
+
+        Other frames than before (the camera's place was heard) are another frame of reference, as a new map is.
+        """
+        if frames is not self._frames:
+            self.forget()
+            self._frames = frames
         if result.world_from_camera is None or result.state not in (TrackingState.TRACKING, TrackingState.HOLD):
             self.transforms.repeat(result.stamp_ns, frames)
             return

@@ -13,10 +13,10 @@ import numpy as np
 from ros_graph import Graph
 from tf2_msgs.msg import TFMessage
 
-from thegra_core.geometry.poses import transform
+from thegra_core.geometry.poses import so3_exp, transform
 from thegra_core.messages import TrackingResult, TrackingState
 from thegra_ros.camera_place import CameraPlace
-from thegra_ros.codec.poses import pose_matrix, transform_message
+from thegra_ros.codec.poses import path_poses, pose_matrix, transform_message
 from thegra_ros.codec.stamps import header, stamp_ns
 from thegra_ros.lifecycle import ManagedNode
 from thegra_ros.node_config import NodeConfig
@@ -105,6 +105,24 @@ def test_forward_is_x_of_the_base(graph: Graph, heard: list) -> None:
     poses = [pose_matrix(m.transforms[0].transform) for m in heard[-3:]]
     for pose, index in zip(poses, (1, 2, 3), strict=True):
         np.testing.assert_allclose(pose, transform(np.eye(3), [2.0 * STEP * index, 0, 0]), atol=1e-12)
+
+
+def test_a_place_that_is_told_after_the_first_image_holds_from_there_on(graph: Graph, heard: list) -> None:
+    """A camera that looks to the left: until that is told it seems to drive ahead."""
+    robot = start(graph, NodeConfig(base_frame="base_link"))
+    until_heard(graph, heard, lambda: robot.move(1))
+    np.testing.assert_allclose(pose_matrix(heard[-1].transforms[0].transform), transform(np.eye(3), [STEP, 0, 0]), atol=1e-12)
+    left = transform(so3_exp([0, 0, np.pi / 2]) @ BODY_FROM_OPTICAL[:3, :3], [-0.4, 0.0, 0.0])
+    static = graph.node.create_publisher(TFMessage, "/tf_static", TF_STATIC)
+    static.publish(TFMessage(transforms=[transform_message(header(0, "base_link"), "thermal_camera", left)]))
+    graph.wait(lambda: robot.place.knows("thermal_camera"), "the static transform")
+    count = len(heard)
+    for index in (2, 3):
+        robot.move(index)
+    graph.wait(lambda: len(heard) >= count + 2)
+    for message, index in zip(heard[count:], (2, 3), strict=True):
+        np.testing.assert_allclose(pose_matrix(message.transforms[0].transform), transform(np.eye(3), [0, STEP * index, 0]), atol=1e-12)
+    graph.wait(lambda: any([stamp for stamp, _ in path_poses(m)] == [2 * S, 3 * S] for m in graph.received["path"]), "a path of poses in one frame of reference")
 
 
 def test_map_to_odom_where_something_else_tells_odometry(graph: Graph, heard: list) -> None:
