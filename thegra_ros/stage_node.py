@@ -138,7 +138,7 @@ class StageNode(ManagedNode):
         self.health.trouble = ""  # of the item before
         try:
             self.work(item)
-            self.health.done += 1
+            self.health.worked()
         except Exception as error:
             if self._ends:
                 return False

@@ -10,6 +10,7 @@ import os
 import signal
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
 from hypothesis import given
 from hypothesis import strategies as st
 from lifecycle_msgs.msg import Transition
@@ -90,6 +91,8 @@ def test_four_nodes_track_and_survive(graph: Graph, frames, camera, recording_pa
     assert np.sqrt((errors**2).sum(axis=1).mean()) < 0.03 * np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
     assert graph.received["map_points"] and graph.received["keyframe_path"]
     assert stages.value("tracking", "lost parts") == lost and stages.value("mapping", "broken records") == 0
+    told = {(s.name.rpartition(" ")[2], s.message) for m in graph.received["/diagnostics"] for s in m.status if s.level == DiagnosticStatus.OK}
+    assert told == {("preprocessing", "working"), ("frontend", "working"), ("tracking", "tracking"), ("mapping", "working")}
 
     graph.received["pose"].clear()  # the bag begins again
     stages.begin_again(frames[0])

@@ -46,6 +46,7 @@ class MappingNode(StageNode):
         self.offer(Trigger, "~/load_map", self._on_load_map)
 
     def prepare(self) -> None:
+        self.health.steady = False  # a camera that stands still makes no keyframes
         self._home = begin_in(self.own)
         self._place = CameraPlace(self, self.own)
         self._updates = self.publisher(PointCloud2, "map_update", LOSSLESS)

@@ -58,7 +58,7 @@ class SlamNode(ManagedNode):
         self._home, self._localizing = begin_in(self._own), self._own.localization_only
         self._place, self._epoch = CameraPlace(self, self._own), 0
         self._map_sent_ns, self._map_id, self._ms, self._age_ms = 0, -1, 0.0, 0.0
-        self._health = Health()
+        self._health = Health(TrackingState.WAITING)
         self._reporter = Reporter(self, self._health, self._facts, self._own.diagnostics_period_s)
         self._camera = CameraInput(self, self._own.camera_file, self._health, self._begin_anew)
         self._poses, self._map, self._tracks = PoseOutputs(self, self._place.frames, self._own), MapOutputs(self), TracksOutput(self)
@@ -182,7 +182,7 @@ class SlamNode(ManagedNode):
         if done.view is not None:
             self._tracks.publish(done.view, self._place.frames.camera)
         self._ms, self._age_ms = ms, (self.get_clock().now().nanoseconds - result.stamp_ns) / 1e6
-        self._health.done += 1
+        self._health.worked()
         if self._health.result_came(result):
             self._reporter.report()
 

@@ -63,6 +63,7 @@ class TrackingNode(StageNode):
         self.offer(SetBool, "~/localization_only", self._on_localization_only)
 
     def prepare(self) -> None:
+        self.health.state = TrackingState.WAITING
         self._place = CameraPlace(self, self.own)
         self._poses = PoseOutputs(self, self._place.frames, self.own)
         self._keyframes = self.publisher(PointCloud2, "keyframe", LOSSLESS)
