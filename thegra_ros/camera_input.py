@@ -17,7 +17,9 @@ from thegra_ros.qos import SENSOR
 
 
 class CameraInput:
-    """Holds the camera model; `on_change` is called with the reason when another one replaces it.
+    """Holds the camera model, None while there is no usable one; `on_change` is called with the reason when another one comes than was last used.
+
+    One that comes again, after a word that cannot be used, is the same object as before.
 
     Raises:
         CalibrationError: If the file cannot be used.
@@ -27,6 +29,7 @@ class CameraInput:
         self._node, self._health = node, health
         self._on_change = on_change
         self._seen: tuple[object, ...] | None = None
+        self._last: CameraModel | None = None
         self._topic = node.resolve_topic_name("camera_info")
         self.camera: CameraModel | None = load_camera(Path(file).expanduser()) if file else None
         self._health.camera_trouble = "" if self.camera else f"no camera_info on {self._topic} yet: remap camera_info to your driver's topic, or give the parameter camera_file"
@@ -40,7 +43,7 @@ class CameraInput:
         return described(self.camera)
 
     def _on_info(self, info: CameraInfo) -> None:
-        seen = (tuple(info.k), tuple(info.d), info.distortion_model, info.width, info.height)
+        seen = (tuple(info.k), tuple(info.d), info.distortion_model, info.width, info.height, tuple(info.p))
         if seen == self._seen:
             return
         self._seen = seen
@@ -49,14 +52,16 @@ class CameraInput:
             self._health.camera_trouble = "" if camera else f"{self._topic} says that the camera is not calibrated (its K is zero): calibrate it, and give the parameter camera_file"
         except CalibrationError as error:
             camera, self._health.camera_trouble = None, f"{self._topic} cannot be used: {error}"
-        before, self.camera = self.camera, camera
-        if camera is None:
+        last = self._last
+        self.camera = last if camera is not None and last is not None and camera.same_as(last) else camera
+        if self.camera is None:
             return
-        what = described(camera)
-        if before is not None:
-            self._on_change(f"{self._topic} changed to {what}")
+        self._last = self.camera
+        what = f"camera {described(self.camera)}, from {self._topic}"
+        if last is not None and self.camera is not last:
+            self._on_change(f"another {what}")
         else:
-            self._node.get_logger().info(f"camera {what}, from {self._topic}")
+            self._node.get_logger().info(what)
 
     def _complain(self) -> None:
         if not self._health.camera_trouble or not self._node.active:

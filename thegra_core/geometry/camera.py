@@ -63,6 +63,15 @@ class CameraModel:
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "distortion", np.pad(given, (0, wanted - len(given))))
 
+    def same_as(self, other: CameraModel) -> bool:
+        """Whether the numbers are the same, whatever the name."""
+        return (
+            self.model is other.model
+            and self.image_size == other.image_size
+            and np.array_equal(self.matrix, other.matrix)
+            and np.array_equal(self.distortion, other.distortion)
+        )
+
     @property
     def focal(self) -> float:
         """Mean focal length (px)."""

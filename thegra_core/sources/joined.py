@@ -103,7 +103,7 @@ class View:
 
     def __init__(self, own: CameraModel, other: CameraModel) -> None:
         self._where: NDArray[np.float32] | None = None
-        if _equal(own, other):
+        if own.same_as(other):
             return
         width, height = other.image_size
         pixels = np.stack(np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)), axis=-1).reshape(-1, 2)
@@ -149,12 +149,6 @@ def _resized(camera: CameraModel, scale: float) -> CameraModel:
     matrix[:2, 2] += 0.5 * (scale - 1)
     width, height = (round(scale * size) for size in camera.image_size)
     return replace(camera, matrix=matrix, image_size=(width, height))
-
-
-def _equal(one: CameraModel, other: CameraModel) -> bool:
-    return (
-        one.model is other.model and one.image_size == other.image_size and np.array_equal(one.matrix, other.matrix) and np.array_equal(one.distortion, other.distortion)
-    )
 
 
 def _some(frames: Iterator[Frame], every: int, most: int | None) -> Iterator[Frame]:

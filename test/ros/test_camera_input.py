@@ -1,0 +1,74 @@
+"""What is made of the calibrations that camera_info brings one after the other."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ros]")
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+
+from sensor_msgs.msg import CameraInfo
+
+from thegra_core.geometry.camera import CameraModel
+from thegra_ros.camera_input import CameraInput
+from thegra_ros.codec.images import camera_info_message
+from thegra_ros.codec.stamps import header
+from thegra_ros.diagnostics import Health
+
+
+class Driver:
+    """Stands for the node that listens, and tells it what a driver publishes."""
+
+    def __init__(self) -> None:
+        self.health, self.changes = Health(), list[str]()
+        self.input = CameraInput(self, "", self.health, self.changes.append)  # type: ignore[arg-type]
+
+    def resolve_topic_name(self, name: str) -> str:
+        return f"/{name}"
+
+    def listen(self, kind: type, topic: str, qos: object, callback: Callable[[CameraInfo], None]) -> None:
+        self._tell = callback
+
+    def every(self, period_s: float, callback: Callable[[], None]) -> None:
+        pass
+
+    def get_logger(self) -> logging.Logger:
+        return logging.getLogger("driver")
+
+    def tell(self, camera: CameraModel, calibrated: bool = True) -> CameraModel | None:
+        """Publish a camera, or that it is not calibrated; the one in use."""
+        message = camera_info_message(header(0, "thermal_camera"), camera)
+        if not calibrated:
+            message.k = 0.0 * message.k
+        self._tell(message)
+        return self.input.camera
+
+
+@pytest.fixture
+def other(camera: CameraModel) -> CameraModel:
+    return replace(camera, matrix=camera.matrix * [[1.5], [1.5], [1.0]])
+
+
+def test_another_camera_is_a_change(camera: CameraModel, other: CameraModel) -> None:
+    driver = Driver()
+    driver.tell(camera)
+    assert driver.changes == [] and driver.tell(other).same_as(other) and len(driver.changes) == 1
+
+
+def test_another_camera_after_none_is_a_change(camera: CameraModel, other: CameraModel) -> None:
+    driver = Driver()
+    driver.tell(camera)
+    assert driver.tell(camera, calibrated=False) is None and "not calibrated" in driver.health.camera_trouble
+    assert driver.tell(other).same_as(other) and driver.health.camera_trouble == ""
+    (change,) = driver.changes
+    assert f"{other.focal:.1f} px" in change
+
+
+def test_the_same_camera_after_none_is_no_change(camera: CameraModel) -> None:
+    driver = Driver()
+    first = driver.tell(camera)
+    driver.tell(camera, calibrated=False)
+    assert driver.tell(camera) is first is not None and driver.changes == []
