@@ -86,7 +86,7 @@ class Engine(Protocol):
 
         Raises:
             EngineError: If it failed; the next frame begins a new map.
-            ThegraError: If the map of `home` cannot be used.
+            ThegraError: If the map of `home` cannot be used; it is tried again with the next job.
         """
 
     def obey(self, order: Order) -> str:

@@ -24,6 +24,9 @@ T = TypeVar("T")
 class NotWorkingError(ThegraError):
     """An order came when nothing works any more."""
 
+    def __init__(self) -> None:
+        super().__init__("the SLAM system does not work: /diagnostics and the log say why")
+
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
@@ -37,18 +40,21 @@ class _Asked:
 class Worker(Generic[T]):
     """Takes items from a bounded queue; `to_job` makes a job of one when its turn comes, or None of one that nobody wants any more.
 
-    `on_done` gets item, result and milliseconds; `on_failure` a text, and whether that is the end. Both are called from the thread. `is_alive` is False
-    once the process is told to end: then failures are no news.
+    `on_done` gets item, result and milliseconds; `on_failure` a text, and whether that is the end; `on_refused` an item whose epoch cannot be begun, and what
+    the user has to put right: the other items of that epoch are passed over. All are called from the thread. `is_alive` is False once the process is told to
+    end: then failures are no news.
     """
 
     def __init__(
         self, make_engine: Callable[[], Engine], queue_size: int, to_job: Callable[[T], Job | None], on_done: Callable[[T, Done, float], None],
-        on_failure: Callable[[str, bool], None], is_alive: Callable[[], bool] = lambda: True,
+        on_failure: Callable[[str, bool], None], on_refused: Callable[[T, str], None], is_alive: Callable[[], bool] = lambda: True,
     ) -> None:  # fmt: skip
-        self._make_engine, self._to_job, self._on_done, self._on_failure, self._is_alive = make_engine, to_job, on_done, on_failure, is_alive
+        self._make_engine, self._to_job, self._is_alive = make_engine, to_job, is_alive
+        self._on_done, self._on_failure, self._on_refused = on_done, on_failure, on_refused
         self.queue: LatestQueue[T | _Asked] = LatestQueue(queue_size)
         self._engine: Engine | None = None
-        self._stopping = False
+        self._stopping = self._given_up = False
+        self._refused_epoch: int | None = None
         self._thread = threading.Thread(target=self._run, name="thegra worker", daemon=True)
 
     def start(self) -> None:
@@ -61,6 +67,11 @@ class Worker(Generic[T]):
         if not self.queue.put_first(asked):
             _refuse(asked)
         return asked.answer
+
+    @property
+    def given_up(self) -> bool:
+        """Whether nothing is worked on any more; `on_failure` has said why."""
+        return self._given_up
 
     def stop(self) -> None:
         """End, giving up the frame in work; waits until it has ended, but not for long where the process is told to end."""
@@ -83,17 +94,21 @@ class Worker(Generic[T]):
                 self._work()
                 return
             except ThegraError as error:  # something the user has to put right first
-                self._on_failure(str(error), True)
+                self._fail(str(error), True)
                 break
             except Exception as error:  # a thread that ends without a word would be a node that does nothing
                 if self._stopping or not self._is_alive():
                     break
                 failures = failures + 1 if self._engine_worked == 0 else 1
-                self._on_failure(str(error) if isinstance(error, EngineError) else traceback.format_exc(), failures == MOST_FAILURES)
+                self._fail(str(error) if isinstance(error, EngineError) else traceback.format_exc(), failures == MOST_FAILURES)
             finally:
                 if self._engine is not None:
                     self._engine.stop()
         self._close()
+
+    def _fail(self, text: str, final: bool) -> None:
+        self._given_up = final
+        self._on_failure(text, final)
 
     def _work(self) -> None:
         self._engine_worked = 0
@@ -106,10 +121,15 @@ class Worker(Generic[T]):
                 self._obey(self._engine, item)
                 continue
             job = self._to_job(item)
-            if job is None:
+            if job is None or job.epoch == self._refused_epoch:
                 continue
             begin = time.monotonic()
-            done = self._engine.process(job)
+            try:
+                done = self._engine.process(job)
+            except ThegraError as error:
+                self._refused_epoch = job.epoch
+                self._on_refused(item, str(error))
+                continue
             self._engine_worked += 1
             self._on_done(item, done, 1e3 * (time.monotonic() - begin))
 
@@ -128,4 +148,4 @@ class Worker(Generic[T]):
 
 
 def _refuse(asked: _Asked) -> None:
-    asked.answer.set_exception(NotWorkingError("the SLAM system does not work: /diagnostics and the log say why"))
+    asked.answer.set_exception(NotWorkingError())

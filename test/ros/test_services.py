@@ -7,9 +7,11 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ros]")
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import SetParameters
 from ros_graph import Graph, set_parameter
@@ -130,6 +132,49 @@ def test_a_map_that_cannot_be_used_is_said(graph: Graph, frames, camera, tmp_pat
     graph.send_camera(camera)
     graph.send(frames[:1])
     graph.wait(lambda: graph.status is not None and "broken.map" in graph.status.message, "a word about the file")
+    assert graph.status.level == DiagnosticStatus.ERROR
     success, why = trigger(graph, "slam/save_map")
+    assert not success and "no map yet" in why
+    graph.send(frames[1:4])  # the same is true of these
+    graph.wait(lambda: graph.value("images") == "4")
+    assert trigger(graph, "slam/reset")[0]
+    graph.send(frames[4:5])
+    graph.wait(lambda: graph.processed() == 1 and "broken.map" not in graph.status.message, "work on a map of its own")
+    assert sum("ERROR" in line and "broken.map" in line for line in node.output.splitlines()) == 1
+    assert node.end() == 0
+
+
+@pytest.mark.slow
+def test_the_camera_of_a_map_is_found_in_it_also_after_another_camera(graph: Graph, frames, camera, tmp_path: Path) -> None:
+    kept = tmp_path / "room.map"
+    node = graph.start(parameters={"map_file": str(kept)})
+    graph.wait_for_listener()
+    graph.send_camera(camera)
+    graph.send(frames[:30])
+    graph.wait(lambda: graph.processed() == 30)
+    assert trigger(graph, "slam/save_map")[0] and node.end() == 0
+    for heard in graph.received.values():
+        heard.clear()
+
+    node = graph.start(parameters={"map_file": str(kept)})
+    graph.wait_for_listener()
+    graph.send_camera(replace(camera, matrix=camera.matrix * [[1.5], [1.5], [1.0]]))
+    graph.send(frames[14:15])
+    graph.wait(lambda: graph.heard(DiagnosticStatus.ERROR, str(kept)), "a word about the camera")
+    graph.send_camera(camera)
+    graph.send(frames[15:22])
+    graph.wait(lambda: graph.processed() == 7)
+    graph.wait(lambda: len(graph.received["pose"]) >= 4, "poses in the map")
+    graph.wait(lambda: graph.heard(DiagnosticStatus.OK, "tracking"))
+    assert node.end() == 0
+
+
+def test_nothing_begins_where_nothing_works(graph: Graph, camera, tmp_path: Path) -> None:
+    graph.environment["THEGRA_WEIGHTS"] = str(tmp_path / "none")
+    node = graph.start(parameters={"extractor.name": "xfeat"})
+    graph.wait_for_listener()
+    graph.send_camera(camera)
+    graph.wait(lambda: graph.heard(DiagnosticStatus.ERROR, "thegra weights"), "what is missing")
+    success, why = trigger(graph, "slam/reset")
     assert not success and "does not work" in why
     assert node.end() == 0

@@ -56,9 +56,11 @@ class Harness:
         self.engines, self.made = list(engines), 0
         self.done: list[int] = []
         self.unwanted: set[int] = set()
+        self.epochs: dict[int, int] = {}
         self.failures: list[tuple[str, bool]] = []
+        self.refused: list[tuple[int, str]] = []
         self.changed = threading.Condition()
-        self.worker: Worker[int] = Worker(self._make, 100, self._job, self._on_done, self._on_failure)
+        self.worker: Worker[int] = Worker(self._make, 100, self._job, self._on_done, self._on_failure, self._on_refused)
         self.worker.start()
 
     def _make(self) -> FakeEngine:
@@ -68,7 +70,7 @@ class Harness:
     def _job(self, item: int) -> Job | None:
         if item in self.unwanted:
             return None
-        return Job(Frame(item, item, np.zeros((2, 2), np.uint8)), thermal_camera((2, 2)), 0)
+        return Job(Frame(item, item, np.zeros((2, 2), np.uint8)), thermal_camera((2, 2)), self.epochs.get(item, 0))
 
     def _on_done(self, item: int, done: Done, ms: float) -> None:
         with self.changed:
@@ -78,6 +80,11 @@ class Harness:
     def _on_failure(self, text: str, final: bool) -> None:
         with self.changed:
             self.failures.append((text, final))
+            self.changed.notify_all()
+
+    def _on_refused(self, item: int, text: str) -> None:
+        with self.changed:
+            self.refused.append((item, text))
             self.changed.notify_all()
 
     def wait(self, condition) -> None:
@@ -117,6 +124,22 @@ def test_what_the_user_must_put_right_is_not_tried_again() -> None:
     harness.wait(lambda: bool(harness.failures))
     harness.worker.stop()
     assert harness.failures == [("fetch them", True)] and harness.made == 1
+    assert harness.worker.given_up
+
+
+def test_an_epoch_that_cannot_be_begun_is_told_once_and_the_next_is_another_try() -> None:
+    """A map of another camera: it is so for each frame, until there is another camera or another map."""
+    wrong = InputError("the map is of another camera")
+    engine = FakeEngine(process=[None, wrong, wrong, None])
+    harness = Harness(engine)
+    harness.epochs = {0: 0, 1: 1, 2: 1, 3: 1, 4: 2, 5: 2, 6: 3, 7: 3}
+    for item in harness.epochs:
+        harness.worker.queue.put(item)
+    harness.wait(lambda: harness.done == [0, 6, 7])
+    assert harness.worker.ask(SaveMap(Path("/a/map"))).result(LIMIT_S) == "written to /a/map", "orders are obeyed all the while"
+    harness.worker.stop()
+    assert harness.refused == [(1, str(wrong)), (4, str(wrong))]
+    assert harness.failures == [] and harness.made == 1 and not harness.worker.given_up
 
 
 def test_orders_are_answered_and_a_refused_one_changes_nothing() -> None:

@@ -25,7 +25,7 @@ from thegra_ros.image_input import ImageInput
 from thegra_ros.lifecycle import ManagedNode, run_node
 from thegra_ros.node_parameters import NodeParameters, begin_in
 from thegra_ros.outputs import MapOutputs, PoseOutputs, TracksOutput
-from thegra_ros.worker import Worker
+from thegra_ros.worker import NotWorkingError, Worker
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class SlamNode(ManagedNode):
         self._camera = CameraInput(self, self._own.camera_file, self._health, self._begin_anew)
         self._poses, self._map, self._tracks = PoseOutputs(self, self._place.frames, self._own), MapOutputs(self), TracksOutput(self)
         self._images = ImageInput(self, self._own.image_transport, self._health, self._on_frame, self._on_restart)
-        self._worker = Worker(self._new_engine, self._own.queue_size, self._to_job, self._on_done, self._on_failure, self.context.ok)
+        self._worker = Worker(self._new_engine, self._own.queue_size, self._to_job, self._on_done, self._on_failure, self._on_refused, self.context.ok)
         self._worker.start()
         self._settings.configured = True
         begins = f"; the camera is sought in the map of {self._home}" if self._home is not None else ""
@@ -113,11 +113,15 @@ class SlamNode(ManagedNode):
     def _forget(self) -> None:
         self._poses.forget()
         self._health.state, self._health.reason = TrackingState.INITIALIZING, ""
+        if not self._given_up:
+            self._health.trouble = ""
         self._map_sent_ns, self._map_id = 0, -1
 
     # ---- services -------------------------------------------------------------------------------------------------------------------
 
     def _on_reset(self, _: Trigger.Request) -> str:
+        if self._given_up:
+            raise NotWorkingError
         if self._localizing and self._home is None:
             raise InputError("only localisation is on, and after a reset there would be no map: call ~/localization_only with false first")
         if not self._localizing:
@@ -150,6 +154,10 @@ class SlamNode(ManagedNode):
             raise InputError("there is no map yet in which the camera could be found: wait for one, or call ~/load_map")
         self._localizing = bool(request.data)
         return "the map stays as it is" if request.data else "the map grows"
+
+    @property
+    def _given_up(self) -> bool:
+        return self._worker is not None and self._worker.given_up
 
     async def _ask(self, order: Order, then: Callable[[], None] = lambda: None) -> str:
         assert self._worker is not None
@@ -192,6 +200,14 @@ class SlamNode(ManagedNode):
         self._begin_anew("the SLAM system failed")
         if final:
             self._health.trouble = text.splitlines()[-1]
+        self._reporter.report()
+
+    def _on_refused(self, waiting: Waiting, text: str) -> None:
+        """What waits is of the same epoch and is passed over: another camera, ~/reset and ~/load_map are another try."""
+        if waiting.epoch != self._epoch:
+            return
+        self.get_logger().error(text)
+        self._health.trouble = text.splitlines()[-1]
         self._reporter.report()
 
     def _facts(self) -> Mapping[str, object]:
