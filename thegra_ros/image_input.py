@@ -17,7 +17,7 @@ from thegra_ros.environment import PROFILES_VARIABLE, config_file, profile_is_se
 from thegra_ros.gap_watch import GapWatch
 from thegra_ros.lifecycle import ManagedNode
 from thegra_ros.qos import SENSOR
-from thegra_ros.stamp_watch import StampWatch
+from thegra_ros.stamp_watch import LEAST_JUMP_NS, StampWatch
 
 MUCH_MISSING = 0.25
 """Share of images; by default Fast DDS loses 28 to 62 % of 640x512 images of 16 bit (measured)."""
@@ -34,7 +34,7 @@ class ImageInput:
         self._topic = node.resolve_topic_name(name)
         node.listen(self._kind, name, SENSOR, self._on_image)
         node.every(COMPLAINT_PERIOD_S, self._complain)
-        backwards = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+        backwards = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-LEAST_JUMP_NS), on_clock_change=False)
         self._jumps = node.get_clock().create_jump_callback(backwards, post_callback=self._on_jump)
 
     @property
