@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import cv2
@@ -10,6 +11,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image, PointCloud2
+from std_msgs.msg import Header
 
 from thegra_core.messages import MapSummary, Snapshot, TrackingResult, TrackingState
 from thegra_ros.codec.clouds import cloud_message
@@ -73,7 +75,7 @@ class PoseOutputs:
         Other frames than before (the camera's place was heard) are another frame of reference, as a new map is.
         """
         if frames is not self._frames:
-            self.forget()
+            self._begin_anew()
             self._frames = frames
         if result.world_from_camera is None or result.state not in (TrackingState.TRACKING, TrackingState.HOLD):
             self.transforms.repeat(result.stamp_ns, frames)
@@ -85,19 +87,24 @@ class PoseOutputs:
             self._odometry.publish(odometry(stamped, frames.child, pose))
             self.transforms.repeat(result.stamp_ns, frames)
             return
+        if result.map_id != self._map_id:
+            self._begin_anew()
+            self._map_id = result.map_id
         self._pose.publish(pose_with_covariance(stamped, pose))
         self._odometry.publish(odometry(stamped, frames.child, pose))
         self.transforms.publish(pose, frames)
-        if result.map_id != self._map_id:
-            self.forget()
-            self._map_id = result.map_id
         self._path.add(result.stamp_ns, pose.map_from_child)
         if not 0 <= result.stamp_ns - self._path_sent_ns < PATH_PERIOD_NS:
             self._path_sent_ns = result.stamp_ns
             self._path_publisher.publish(path_message(stamped, self._path.poses()))
 
     def forget(self) -> None:
-        """The map began anew: the old path is in no frame any more."""
+        """The map began anew: the old path is in no frame any more, and who comes later gets an empty one."""
+        if self._path_sent_ns:
+            self._path_publisher.publish(path_message(header(self._path_sent_ns, self._frames.map), []))
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
         self._path.clear()
         self._path_sent_ns = 0
         self._map_id = None
@@ -110,13 +117,23 @@ class MapOutputs:
     def __init__(self, node: ManagedNode) -> None:
         self._points = node.publisher(PointCloud2, "map_points", LATCHED)
         self._keyframes = node.publisher(Path, "keyframe_path", LATCHED)
+        self._shown: Header | None = None
 
     def publish(self, stamp_ns: int, summary: MapSummary, frames: Frames) -> None:
         """Publish a map."""
-        stamped = header(stamp_ns, frames.map)
-        x, y, z = map_points(summary.points_world, frames).astype(np.float32).T
-        self._points.publish(cloud_message(stamped, {"x": x, "y": y, "z": z, "intensity": summary.point_scores.astype(np.float32)}))
+        self._shown = header(stamp_ns, frames.map)
         keyframes = zip(summary.keyframe_stamps_ns.tolist(), (map_pose(pose, frames) for pose in summary.keyframe_poses), strict=True)
+        self._send(self._shown, map_points(summary.points_world, frames), summary.point_scores, keyframes)
+
+    def forget(self) -> None:
+        """The map began anew: who comes later gets an empty one."""
+        if self._shown is not None:
+            self._send(self._shown, np.empty((0, 3)), np.empty(0), [])
+            self._shown = None
+
+    def _send(self, stamped: Header, points: FloatArray, scores: NDArray[np.floating], keyframes: Iterable[tuple[int, FloatArray]]) -> None:
+        x, y, z = points.astype(np.float32).T
+        self._points.publish(cloud_message(stamped, {"x": x, "y": y, "z": z, "intensity": scores.astype(np.float32)}))
         self._keyframes.publish(path_message(stamped, keyframes))
 
 

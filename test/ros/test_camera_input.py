@@ -6,11 +6,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ros]")
 
-import logging
-from collections.abc import Callable
 from dataclasses import replace
 
-from sensor_msgs.msg import CameraInfo
+from stub_node import StubNode
 
 from thegra_core.geometry.camera import CameraModel
 from thegra_ros.camera_input import CameraInput
@@ -20,30 +18,18 @@ from thegra_ros.diagnostics import Health
 
 
 class Driver:
-    """Stands for the node that listens, and tells it what a driver publishes."""
+    """Tells an input what a driver publishes."""
 
     def __init__(self) -> None:
-        self.health, self.changes = Health(), list[str]()
-        self.input = CameraInput(self, "", self.health, self.changes.append)  # type: ignore[arg-type]
-
-    def resolve_topic_name(self, name: str) -> str:
-        return f"/{name}"
-
-    def listen(self, kind: type, topic: str, qos: object, callback: Callable[[CameraInfo], None]) -> None:
-        self._tell = callback
-
-    def every(self, period_s: float, callback: Callable[[], None]) -> None:
-        pass
-
-    def get_logger(self) -> logging.Logger:
-        return logging.getLogger("driver")
+        self._node, self.health, self.changes = StubNode(), Health(), list[str]()
+        self.input = CameraInput(self._node, "", self.health, self.changes.append)
 
     def tell(self, camera: CameraModel, calibrated: bool = True) -> CameraModel | None:
         """Publish a camera, or that it is not calibrated; the one in use."""
         message = camera_info_message(header(0, "thermal_camera"), camera)
         if not calibrated:
             message.k = 0.0 * message.k
-        self._tell(message)
+        self._node.tell("camera_info", message)
         return self.input.camera
 
 

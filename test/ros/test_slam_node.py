@@ -11,8 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Path as PathMessage
 from ros_graph import OFFLINE, Graph
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import Image, PointCloud2
 from stages import noisy_copies
 from std_srvs.srv import SetBool, Trigger
 
@@ -70,6 +71,10 @@ def test_poses_are_those_of_the_offline_run(graph: Graph, frames, camera, record
     assert node.end(signal.SIGINT) == 0
 
 
+def count(message: PathMessage | PointCloud2) -> int:
+    return message.width if isinstance(message, PointCloud2) else len(message.poses)
+
+
 @pytest.mark.slow
 def test_reset_pause_and_stamps_that_go_back(graph: Graph, frames, camera) -> None:
     node = graph.start()
@@ -93,7 +98,10 @@ def test_reset_pause_and_stamps_that_go_back(graph: Graph, frames, camera) -> No
     assert [stamp_ns(m) for m in graph.received["pose"]] == [*told, *told]
     assert node.output.count("a new map begins") == 1 and "stamps went back" in node.output
 
+    latched = [graph.received[topic] for topic in ("path", "keyframe_path", "map_points")]
+    assert all(count(kept[-1]) for kept in latched)
     assert graph.call(Trigger, "slam/reset", Trigger.Request()).success
+    graph.wait(lambda: not any(count(kept[-1]) for kept in latched), "nothing of the old map for who comes later")
     graph.received["/diagnostics"].clear()
     graph.send([replace(frame, stamp_ns=frame.stamp_ns + 10**10) for frame in frames[:2]])
     graph.wait(lambda: graph.heard(DiagnosticStatus.WARN, "no map yet"))

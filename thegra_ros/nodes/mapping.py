@@ -133,6 +133,7 @@ class MappingNode(StageNode):
         self._replaced = False
         whole: Whole | None = self._call("whole")
         if whole is None:
+            self._outputs.forget()
             self._send("empty", [word(question)], stamp)
             return
         taken = {**question, "next_map": str(whole.next_map), "next_keyframe": str(whole.next_keyframe)}

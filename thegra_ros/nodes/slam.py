@@ -112,6 +112,7 @@ class SlamNode(ManagedNode):
 
     def _forget(self) -> None:
         self._poses.forget()
+        self._map.forget()
         self._health.state, self._health.reason = TrackingState.INITIALIZING, ""
         if not self._given_up:
             self._health.trouble = ""

@@ -1,0 +1,36 @@
+"""What stands for a node where its parts are tested without a graph: it keeps what they publish, and tells them what they listen to."""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+
+class StubNode:
+    """sent: what was published, by topic."""
+
+    def __init__(self) -> None:
+        self.sent: defaultdict[str, list[Any]] = defaultdict(list)
+        self._listeners: dict[str, Callable[[Any], None]] = {}
+
+    def tell(self, topic: str, message: Any) -> None:
+        """A message comes in."""
+        self._listeners[topic](message)
+
+    def resolve_topic_name(self, name: str) -> str:
+        return f"/{name}"
+
+    def publisher(self, kind: type, topic: str, qos: object) -> SimpleNamespace:
+        return SimpleNamespace(publish=self.sent[topic].append)
+
+    def listen(self, kind: type, topic: str, qos: object, callback: Callable[[Any], None]) -> None:
+        self._listeners[topic] = callback
+
+    def every(self, period_s: float, callback: Callable[[], None]) -> None:
+        """No timer ever fires."""
+
+    def get_logger(self) -> logging.Logger:
+        return logging.getLogger("stub")
