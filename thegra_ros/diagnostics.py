@@ -59,6 +59,7 @@ class Health:
     bad: Counter[str] = field(default_factory=Counter)
     clock: Callable[[], float] = time.monotonic
     _bad_before: Counter[str] = field(default_factory=Counter)
+    _useful: bool = True
 
     def image_came(self) -> None:
         """An image was received."""
@@ -71,11 +72,17 @@ class Health:
         self.images += 1
         self.last_sign_s = now_s
 
+    def is_of_no_use(self, reason: str) -> None:
+        """What is being worked on cannot be used."""
+        self.bad[reason] += 1
+        self._useful = False
+
     def worked(self) -> None:
         """What came was worked on; a tracker says by `result_came` whether anything came of it."""
         self.done += 1
-        if self.state is None:
+        if self.state is None and self._useful:
             self._answered()
+        self._useful = True
 
     def result_came(self, result: TrackingResult) -> bool:
         """What a frame came to; True if that changes what there is to say."""

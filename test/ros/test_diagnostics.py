@@ -81,6 +81,16 @@ def test_a_node_that_says_nothing_of_tracking_is_judged_by_its_work() -> None:
     assert judge(stream.work()) == (OK, "working")
 
 
+def test_images_that_are_worked_on_in_vain_are_not_ok() -> None:
+    stream = Stream()
+    stream.work(LONG)
+    for _ in range(LONG):
+        stream.come(1).is_of_no_use("stamp repeats")
+        stream.health.worked()
+    assert judge(stream.health) == (WARN, "images come, but none was worked on for 6 s: stamp repeats")
+    assert judge(stream.work()) == (OK, "working")
+
+
 def test_a_tracker_that_works_but_finds_no_result_is_not_ok() -> None:
     stream = Stream(TrackingState.WAITING)
     stream.track()

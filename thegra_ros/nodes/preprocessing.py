@@ -45,7 +45,7 @@ class PreprocessingNode(StageNode):
         frame, frame_id = item
         prepared = self._stage.process(frame)
         if prepared.shutter is None:
-            self.health.bad[prepared.trouble] += 1
+            self.health.is_of_no_use(prepared.trouble)
             return
         self._notices.publish(notice_message(FrameNotice(prepared.shutter, self._epoch, frame_id)))
         if prepared.image is not None:
