@@ -10,15 +10,23 @@ from typing import Any
 
 
 class StubNode:
-    """sent: what was published, by topic."""
+    """An active node. sent: what was published, by topic."""
+
+    active = True
 
     def __init__(self) -> None:
         self.sent: defaultdict[str, list[Any]] = defaultdict(list)
         self._listeners: dict[str, Callable[[Any], None]] = {}
+        self._timers: list[Callable[[], None]] = []
 
     def tell(self, topic: str, message: Any) -> None:
         """A message comes in."""
         self._listeners[topic](message)
+
+    def let_time_pass(self) -> None:
+        """Every timer fires once."""
+        for fire in self._timers:
+            fire()
 
     def resolve_topic_name(self, name: str) -> str:
         return f"/{name}"
@@ -30,7 +38,7 @@ class StubNode:
         self._listeners[topic] = callback
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """No timer ever fires."""
+        self._timers.append(callback)
 
     def get_logger(self) -> logging.Logger:
         return logging.getLogger("stub")

@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 from ros_graph import Graph
+from stub_node import StubNode
 from tf2_msgs.msg import TFMessage
 
 from thegra_core.geometry.poses import so3_exp, transform
@@ -123,6 +124,24 @@ def test_a_place_that_is_told_after_the_first_image_holds_from_there_on(graph: G
     for message, index in zip(heard[count:], (2, 3), strict=True):
         np.testing.assert_allclose(pose_matrix(message.transforms[0].transform), transform(np.eye(3), [0, STEP * index, 0]), atol=1e-12)
     graph.wait(lambda: any([stamp for stamp, _ in path_poses(m)] == [2 * S, 3 * S] for m in graph.received["path"]), "a path of poses in one frame of reference")
+
+
+def test_a_place_that_nothing_tells_is_complained_of_until_it_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    node = StubNode()
+    place = CameraPlace(node, NodeConfig(base_frame="base_link"))
+
+    def complaint() -> str:
+        caplog.clear()
+        node.let_time_pass()
+        return caplog.text
+
+    assert complaint() == "", "no image has come"
+    place.see("thermal_camera")
+    assert "nothing tells the place of thermal_camera on base_link" in complaint()
+    node.tell("/tf_static", TFMessage(transforms=[transform_message(header(0, "base_link"), "thermal_camera", BASE_FROM_CAMERA)]))
+    place.see("thermal_camera")
+    assert complaint() == ""
+    np.testing.assert_allclose(place.frames.base_from_camera, BASE_FROM_CAMERA)
 
 
 def test_map_to_odom_where_something_else_tells_odometry(graph: Graph, heard: list) -> None:
