@@ -9,7 +9,7 @@ from sensor_msgs.msg import CameraInfo
 
 from thegra_core.errors import CalibrationError
 from thegra_core.geometry.camera import CameraModel
-from thegra_core.sources.calibration import camera_from_info, load_camera
+from thegra_core.sources.calibration import camera_from_info, is_rectified, load_camera
 from thegra_ros.diagnostics import COMPLAINT_PERIOD_S, Health
 from thegra_ros.elsewhere import advice
 from thegra_ros.lifecycle import ManagedNode
@@ -19,7 +19,8 @@ from thegra_ros.qos import SENSOR
 class CameraInput:
     """Holds the camera model, None while there is no usable one; `on_change` is called with the reason when another one comes than was last used.
 
-    One that comes again, after a word that cannot be used, is the same object as before.
+    One that comes again, after a word that cannot be used, is the same object as before. Of images whose topic says that they are rectified it is that of the
+    matrix P.
 
     Raises:
         CalibrationError: If the file cannot be used.
@@ -31,6 +32,7 @@ class CameraInput:
         self._seen: tuple[object, ...] | None = None
         self._last: CameraModel | None = None
         self._topic = node.resolve_topic_name("camera_info")
+        self._rectified = is_rectified(node.resolve_topic_name("image_raw"))
         self.camera: CameraModel | None = load_camera(Path(file).expanduser()) if file else None
         self._health.camera_trouble = "" if self.camera else f"no camera_info on {self._topic} yet: remap camera_info to your driver's topic, or give the parameter camera_file"
         if self.camera is None:
@@ -48,8 +50,8 @@ class CameraInput:
             return
         self._seen = seen
         try:
-            camera = camera_from_info(info)
-            self._health.camera_trouble = "" if camera else f"{self._topic} says that the camera is not calibrated (its K is zero): calibrate it, and give the parameter camera_file"
+            camera, zero = camera_from_info(info, self._rectified), "P" if self._rectified else "K"
+            self._health.camera_trouble = "" if camera else f"{self._topic} says that the camera is not calibrated (its {zero} is zero): calibrate it, and give the parameter camera_file"
         except CalibrationError as error:
             camera, self._health.camera_trouble = None, f"{self._topic} cannot be used: {error}"
         last = self._last

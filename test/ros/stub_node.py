@@ -10,11 +10,12 @@ from typing import Any
 
 
 class StubNode:
-    """An active node. sent: what was published, by topic."""
+    """An active node. remapped: other names of topics; sent: what was published, by topic."""
 
     active = True
 
-    def __init__(self) -> None:
+    def __init__(self, **remapped: str) -> None:
+        self._remapped = remapped
         self.sent: defaultdict[str, list[Any]] = defaultdict(list)
         self._listeners: dict[str, Callable[[Any], None]] = {}
         self._timers: list[Callable[[], None]] = []
@@ -29,7 +30,7 @@ class StubNode:
             fire()
 
     def resolve_topic_name(self, name: str) -> str:
-        return f"/{name}"
+        return self._remapped.get(name, f"/{name}")
 
     def publisher(self, kind: type, topic: str, qos: object) -> SimpleNamespace:
         return SimpleNamespace(publish=self.sent[topic].append)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install -e .[ros]")
@@ -36,6 +37,18 @@ class Driver:
 @pytest.fixture
 def other(camera: CameraModel) -> CameraModel:
     return replace(camera, matrix=camera.matrix * [[1.5], [1.5], [1.0]])
+
+
+def test_rectified_images_have_the_camera_of_the_projection(camera: CameraModel) -> None:
+    node, health = StubNode(image_raw="/cam/image_rect"), Health()
+    given = CameraInput(node, "", health, lambda _: None)
+    message = camera_info_message(header(0, "thermal_camera"), camera)
+    node.tell("camera_info", message)
+    assert given.camera is not None and not given.camera.distortion.any()
+    np.testing.assert_array_equal(given.camera.matrix, camera.matrix)
+    message.p = 0.0 * message.p
+    node.tell("camera_info", message)
+    assert given.camera is None and "its P is zero" in health.camera_trouble
 
 
 def test_another_camera_is_a_change(camera: CameraModel, other: CameraModel) -> None:
