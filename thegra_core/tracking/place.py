@@ -61,7 +61,8 @@ class Place:
 
     def take(self, update: MapUpdate) -> None:
         self.map.apply(update)
-        self.reference_id, self.last_keyframe_id = (self._or_heir(i, update) for i in (self.reference_id, self.last_keyframe_id))
+        heirs = {removed.id: removed.heir_id for removed in update.removed_keyframes}
+        self.reference_id, self.last_keyframe_id = (heirs.get(i, i) for i in (self.reference_id, self.last_keyframe_id))
         if update.adjusted_id >= self.unadjusted_id:
             self.unadjusted_id = -1
         for removed in update.removed_keyframes:
@@ -76,10 +77,3 @@ class Place:
 
     def predict(self, stamp_ns: int) -> FloatArray | None:
         return self.motion.predict(stamp_ns) if self.lost_frames == 0 else None
-
-    def _or_heir(self, keyframe_id: int, update: MapUpdate) -> int:
-        """The keyframe, or the one that stays for it where an update has removed it."""
-        heirs = {removed.id: removed.heir_id for removed in update.removed_keyframes}
-        while keyframe_id in heirs and keyframe_id not in self.map.keyframes:
-            keyframe_id = heirs[keyframe_id]
-        return keyframe_id

@@ -270,10 +270,11 @@ class TrackingStage:
                 place.probation, self._before = 0, None
 
     def relative_to_reference(self, result: TrackingResult) -> tuple[int, FloatArray]:
-        """A keyframe of the current map and reference_from_camera (4, 4) of a result that has a pose; one that mapping does not know yet is its own."""
+        """A keyframe of the current map and reference_from_camera (4, 4) of a result that has a pose, before updates that came since; the first keyframes of a map
+        that mapping has not made yet are their own."""
         assert self._place is not None and result.world_from_camera is not None
         keyframes = self._place.map.keyframes
-        if result.is_keyframe and (result.reference_id in keyframes or not self._place.begun):
+        if not self._place.begun:
             return result.reference_id, np.eye(4)
         reference_id = result.reference_id if result.reference_id in keyframes else self._place.reference_id
         return reference_id, keyframes[reference_id].camera_from_world @ result.world_from_camera

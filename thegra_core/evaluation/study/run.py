@@ -65,8 +65,9 @@ def run_study(plan: Plan, progress: Callable[[str], None] | None = None) -> list
         InputError: If a recording has no two frames that far apart, or the plan's folder cannot be written.
         WeightsError: If a network's weights are not there.
     """
-    with writing_to(plan.out):  # told before the work
-        rows: list[Row] = []
+    with writing_to(plan.out):
+        pass  # told before the work
+    rows: list[Row] = []
     say = progress or (lambda _: None)
     front_ends = {name: _front_end(name, plan.cache) for name in dict.fromkeys(front_end for _, front_end in variants(plan))}
     for path in plan.recordings:
